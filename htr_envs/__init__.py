@@ -1,0 +1,28 @@
+"""Task families with sparse rewards for meta-reinforcement learning. Importing the package registers the environments."""
+
+from gymnasium.envs.registration import register
+
+from htr_envs.check_task_env import check_task_env
+from htr_envs.point_robot import PointRobotEnv, PointRobotFamily, PointRobotVectorEnv
+from htr_envs.semicircle_goals import SemicircleGoalFamily
+from htr_envs.task_env import TaskEnv, TaskFamily, Trajectory
+from htr_envs.task_vector_env import TaskVectorEnv
+
+__all__ = [
+    "PointRobotEnv",
+    "PointRobotFamily",
+    "PointRobotVectorEnv",
+    "SemicircleGoalFamily",
+    "TaskEnv",
+    "TaskFamily",
+    "TaskVectorEnv",
+    "Trajectory",
+    "check_task_env",
+]
+
+register(
+    id="SparsePointRobot-v0",
+    entry_point="htr_envs.point_robot:PointRobotEnv",
+    vector_entry_point="htr_envs.point_robot:PointRobotVectorEnv",
+    max_episode_steps=20,
+)

@@ -1,0 +1,122 @@
+"""Tasks that are goal positions on a semicircle around the start."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+
+from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, check_reward_type
+
+
+class SemicircleGoalFamily(TaskFamily):
+    """Goals (x, y) at one distance from the start, at angles from 0 to pi; a subclass says what reaching one is worth.
+
+    The angles of the train and test tasks are evenly spaced and shuffled; those of the validation tasks are drawn uniformly.
+    Everything follows ``task_seed``, never the seed of a run. The first two numbers of an observation are the position.
+
+    :param arena: goals and hindsight goals lie in the square [-arena, arena]^2.
+    :param goal_distance: distance of the goals from the start at (0, 0).
+    :param goal_radius: a goal is reached where the distance to it is smaller than this.
+    :param n_train_tasks: how many training tasks.
+    :param n_test_tasks: how many test tasks.
+    :param n_validation_tasks: how many validation tasks.
+    :param task_seed: seed of the task sets.
+    :raises ValueError: if a number is out of range.
+    """
+
+    def __init__(
+        self,
+        arena: float,
+        goal_distance: float,
+        goal_radius: float,
+        n_train_tasks: int,
+        n_test_tasks: int,
+        n_validation_tasks: int,
+        task_seed: int,
+    ) -> None:
+        if not 0.0 < goal_distance <= arena:
+            raise ValueError(f"goal_distance is {goal_distance}, expected a number above 0 and up to {arena}.")
+        if not goal_radius > 0.0:
+            raise ValueError(f"goal_radius is {goal_radius}, expected a number above 0.")
+        if min(n_train_tasks, n_test_tasks, n_validation_tasks) < 1:
+            raise ValueError(
+                f"n_train_tasks, n_test_tasks, n_validation_tasks are {n_train_tasks}, {n_test_tasks}, {n_validation_tasks}: "
+                "each must be at least 1."
+            )
+        self.goal_distance = float(goal_distance)
+        self.goal_radius = float(goal_radius)
+        # numpy never changes RandomState's stream, as it may Generator's: the tasks stay the same for good
+        random_state = np.random.RandomState(task_seed)
+        angles = np.linspace(0.0, np.pi, n_train_tasks + n_test_tasks)
+        random_state.shuffle(angles)
+        super().__init__(
+            task_space=spaces.Box(-arena, arena, (2,), np.float32),
+            train_tasks=self._goals(angles[:n_train_tasks]),
+            validation_tasks=self._goals(random_state.uniform(0.0, np.pi, n_validation_tasks)),
+            test_tasks=self._goals(angles[n_train_tasks:]),
+        )
+
+    def _goals(self, angles: NDArray[np.float64]) -> FloatArray:
+        goals: FloatArray = (self.goal_distance * np.stack((np.cos(angles), np.sin(angles)), axis=-1)).astype(np.float32)
+        return goals
+
+    def _distance(self, traj: Trajectory, task: ArrayLike) -> FloatArray:
+        offset = traj.next_observations[..., :2] - np.asarray(task, dtype=np.float32)[..., None, :]
+        # not np.linalg.norm: its sum may be ordered by memory layout, and rewards must be the same bits for any batch shape
+        distance: FloatArray = np.sqrt(offset[..., 0] ** 2 + offset[..., 1] ** 2, dtype=np.float32)
+        return distance
+
+    @abstractmethod
+    def _goal_reward(self, distance: FloatArray) -> FloatArray:
+        """Sparse reward at these distances to the goal, where each of them reaches it."""
+
+    def sample_tasks(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw goals at uniform angles.
+
+        :param n: how many tasks.
+        :param rng: the only source of randomness.
+        :return: goals, shape (n, 2).
+        """
+        return self._goals(rng.uniform(0.0, np.pi, n))
+
+    def compute_reward(self, traj: Trajectory, task: ArrayLike, reward_type: str = "sparse") -> FloatArray:
+        """Goal reward plus task-free reward of every step.
+
+        :param traj: the steps, arrays of shape (..., T, dim).
+        :param task: the goal, shape (..., 2); its leading axes broadcast with those of ``traj``.
+        :param reward_type: ``"sparse"``: 0 for the goal where it is not reached. ``"dense"``: minus the distance to the goal.
+        :return: rewards, shape (..., T), float32.
+        :raises ValueError: if the reward type is unknown.
+        """
+        check_reward_type(reward_type)
+        distance = self._distance(traj, task)
+        if reward_type == "dense":
+            goal_reward = -distance
+        else:
+            goal_reward = np.where(distance < self.goal_radius, self._goal_reward(distance), np.float32(0.0))
+        return np.asarray(goal_reward + traj.task_free_reward, dtype=np.float32)
+
+    def is_success(self, traj: Trajectory, task: ArrayLike) -> BoolArray:
+        """Whether the next state of every step is within the goal radius.
+
+        :param traj: the steps, arrays of shape (..., T, dim).
+        :param task: the goal, shape (..., 2); its leading axes broadcast with those of ``traj``.
+        :return: successes, shape (..., T).
+        """
+        return np.asarray(self._distance(traj, task) < self.goal_radius)
+
+    def hindsight_task(self, traj: Trajectory, index: ArrayLike) -> FloatArray:
+        """The position after one step, which is the goal that this step reaches.
+
+        :param traj: the steps, arrays of shape (..., T, dim).
+        :param index: which step, an int or an int array that broadcasts with the leading axes of ``traj``.
+        :return: goals, shape (..., 2), float32, sharing no memory with ``traj``.
+        """
+        positions = np.asarray(traj.next_observations, dtype=np.float32)[..., :2]
+        leading = np.broadcast_shapes(np.shape(index), positions.shape[:-2])
+        positions = np.broadcast_to(positions, leading + positions.shape[-2:])
+        indices = np.broadcast_to(np.asarray(index), leading)[..., None, None]
+        return np.take_along_axis(positions, indices, axis=-2)[..., 0, :]

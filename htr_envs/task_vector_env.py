@@ -1,0 +1,192 @@
+"""The batched counterpart of a task environment: one array step for all copies."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike, NDArray
+
+from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, check_reward_type, task_from_options
+
+
+class TaskVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]], ABC):
+    """Many copies of a task environment that step together, without a loop over them.
+
+    A subclass writes the same two hooks as for :class:`htr_envs.TaskEnv`, on arrays. The rule on tasks is the same too, for
+    each copy on its own: a task once given stays until it is changed, a copy that was given none draws one at each reset.
+
+    A finished copy is reset within the same step (``AutoresetMode.SAME_STEP``): the observation returned is then the first one
+    of its next episode. Everything else that ``step`` returns belongs to the step that was done:
+
+    - ``infos["task_id"]`` (num_envs,), int64: indices into ``train_tasks``, -1 for a task given as a vector;
+    - ``infos["is_success"]`` (num_envs,), bool;
+    - ``infos["achieved_task"]`` (num_envs, task_dim), float32: the tasks that the next states solve;
+    - ``infos["task_free_reward"]`` (num_envs,), float32;
+    - ``infos["final_obs"]`` (num_envs, obs_dim), float32: a plain array, the next observations before any reset; and
+      ``infos["_final_obs"]`` (num_envs,), bool: where they end an episode, which is where ``final_obs`` has a meaning.
+
+    The tasks of the episodes now running, after any reset, are ``tasks`` and ``task_ids``.
+
+    :param task_family: tasks and rewards.
+    :param num_envs: how many copies.
+    :param single_observation_space: observation space of one copy, shape (obs_dim,).
+    :param single_action_space: action space of one copy, shape (act_dim,).
+    :param max_episode_steps: steps after which an episode is truncated, None for never.
+    :param reward_type: reward of ``step``, ``"sparse"`` (the true one) or ``"dense"`` (the proxy).
+    :raises ValueError: if the reward type is unknown or a number is smaller than 1.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # type: ignore[misc]
+
+    def __init__(
+        self,
+        task_family: TaskFamily,
+        num_envs: int,
+        single_observation_space: spaces.Box,
+        single_action_space: spaces.Box,
+        max_episode_steps: int | None,
+        reward_type: str = "sparse",
+    ) -> None:
+        check_reward_type(reward_type)
+        if num_envs < 1 or (max_episode_steps is not None and max_episode_steps < 1):
+            raise ValueError(f"num_envs is {num_envs} and max_episode_steps {max_episode_steps}: both must be at least 1.")
+        self.task_family = task_family
+        self.reward_type = reward_type
+        self.num_envs = num_envs
+        self.max_episode_steps = max_episode_steps
+        self.single_observation_space = single_observation_space
+        self.single_action_space = single_action_space
+        self.observation_space = batch_space(single_observation_space, num_envs)
+        self.action_space = batch_space(single_action_space, num_envs)
+
+        task_shape = (num_envs, *task_family.train_tasks.shape[1:])
+        self._given = np.zeros(num_envs, dtype=np.bool_)
+        self._given_ids = np.full(num_envs, -1, dtype=np.int64)
+        self._given_tasks = np.zeros(task_shape, dtype=np.float32)
+        self._task_ids = np.full(num_envs, -1, dtype=np.int64)
+        self._tasks = np.zeros(task_shape, dtype=np.float32)
+        self._elapsed_steps = np.zeros(num_envs, dtype=np.int64)
+        self._observations: FloatArray | None = None
+
+    @abstractmethod
+    def _reset_state(self, indices: NDArray[np.int64]) -> FloatArray:
+        """Put some copies in a start state, drawn with ``self.np_random``.
+
+        :param indices: which copies, shape (n,).
+        :return: their first observations, shape (n, obs_dim), float32.
+        """
+
+    @abstractmethod
+    def _step_state(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Move all copies by one step.
+
+        :param actions: the agent's actions, shape (num_envs, act_dim), float32, not clipped.
+        :return: next observations (num_envs, obs_dim), task-free rewards (num_envs,), which copies terminate (num_envs,).
+        """
+
+    def set_task(self, tasks: ArrayLike | None, indices: ArrayLike | None = None) -> None:
+        """Choose the tasks of the episodes from the next reset of each copy on.
+
+        :param tasks: indices into ``train_tasks``, shape (n,), or vectors, shape (n, task_dim), one for each copy meant; or
+            None to draw a training task at each reset.
+        :param indices: which copies are meant, ints (n,) or a mask (num_envs,); None for all of them.
+        :raises ValueError: if an id is out of range, a vector not in the task space, or their number wrong.
+        """
+        chosen = np.arange(self.num_envs)
+        if indices is not None:
+            chosen = np.atleast_1d(chosen[np.asarray(indices)])
+        if tasks is None:
+            self._given[chosen] = False
+        else:
+            self._give("task" if np.ndim(tasks) > 1 else "task_id", tasks, chosen)
+
+    def _give(self, key: str, value: Any, indices: NDArray[np.int64]) -> None:
+        if key == "task_id":
+            task_ids = self.task_family.task_indices(value, indices.shape)
+            self._given_ids[indices], self._given_tasks[indices] = task_ids, self.task_family.train_tasks[task_ids]
+        else:
+            vectors = self.task_family.task_vectors(value, indices.shape + self._tasks.shape[1:])
+            self._given_ids[indices], self._given_tasks[indices] = -1, vectors
+        self._given[indices] = True
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[FloatArray, dict[str, Any]]:
+        """Start an episode in every copy.
+
+        :param seed: seed of the one generator that all copies share, None to go on with it.
+        :param options: ``{"task_id": ids}``, shape (num_envs,), or ``{"task": vectors}``, shape (num_envs, task_dim); like
+            ``set_task`` before.
+        :return: first observations (num_envs, obs_dim), float32, and infos with ``task_id``.
+        :raises ValueError: if an option is unknown or its tasks are invalid.
+        """
+        chosen = task_from_options(options)
+        super().reset(seed=seed)
+        everyone = np.arange(self.num_envs)
+        if chosen is not None:
+            self._give(*chosen, everyone)
+        assert self.single_observation_space.shape is not None
+        self._observations = np.zeros((self.num_envs, *self.single_observation_space.shape), dtype=np.float32)
+        self._begin_episodes(self._observations, everyone)
+        return self._observations.copy(), {"task_id": self.task_ids}
+
+    def _begin_episodes(self, observations: FloatArray, indices: NDArray[np.int64]) -> None:
+        # drawn for all of them even if it is not used, for the reason given in TaskEnv.reset
+        drawn = self.np_random.integers(len(self.task_family.train_tasks), size=len(indices))
+        given = self._given[indices]
+        self._task_ids[indices] = np.where(given, self._given_ids[indices], drawn)
+        self._tasks[indices] = np.where(given[:, None], self._given_tasks[indices], self.task_family.train_tasks[drawn])
+        self._elapsed_steps[indices] = 0
+        observations[indices] = self._reset_state(indices)
+
+    def step(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
+        """Do one step in every copy, and reset those that it finishes.
+
+        :param actions: the actions, shape (num_envs, act_dim).
+        :return: observations (num_envs, obs_dim), rewards, terminations, truncations (num_envs,), infos as in the class.
+        :raises ValueError: if the actions have the wrong shape.
+        :raises gymnasium.error.ResetNeeded: before the first reset.
+        """
+        if self._observations is None:
+            raise ResetNeeded("step was called before the first reset: call reset() first.")
+        actions = np.array(actions, dtype=np.float32)
+        if actions.shape != self.action_space.shape:
+            raise ValueError(
+                f"The actions have shape {actions.shape}, expected {self.action_space.shape}: pass a row for each env."
+            )
+        states, task_free_reward, terminated = self._step_state(actions)
+        final_obs = np.array(states, dtype=np.float32)
+        # an axis of T = 1 makes every copy a trajectory of its own, with its own task
+        traj = Trajectory(*(values[:, None] for values in (self._observations, actions, final_obs, task_free_reward)))
+        rewards = self.task_family.compute_reward(traj, self._tasks, self.reward_type)[:, 0]
+        self._elapsed_steps += 1
+        truncated = np.zeros(self.num_envs, dtype=np.bool_)
+        if self.max_episode_steps is not None:
+            truncated = self._elapsed_steps >= self.max_episode_steps
+        done = terminated | truncated
+        infos = {
+            "task_id": self.task_ids,
+            "is_success": self.task_family.is_success(traj, self._tasks)[:, 0],
+            "achieved_task": self.task_family.hindsight_task(traj, 0),
+            "task_free_reward": np.array(task_free_reward, dtype=np.float32),
+            "final_obs": final_obs,
+            "_final_obs": done,
+        }
+        self._observations = final_obs.copy()
+        if done.any():
+            self._begin_episodes(self._observations, np.flatnonzero(done))
+        return self._observations.copy(), rewards, np.array(terminated), truncated, infos
+
+    @property
+    def tasks(self) -> FloatArray:
+        """Tasks of the current episodes, shape (num_envs, task_dim), a copy."""
+        return self._tasks.copy()
+
+    @property
+    def task_ids(self) -> NDArray[np.int64]:
+        """Indices of the current episodes' tasks in ``train_tasks``, -1 for a task given as a vector, (num_envs,), a copy."""
+        return self._task_ids.copy()

@@ -1,0 +1,74 @@
+"""Types shared by all of ``sb3_htr``: what it expects of a task family, and what the replay buffer hands out."""
+
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import torch as th
+
+
+class Trajectory(NamedTuple):
+    """
+    Steps handed to a task family's reward hook; has the attributes of ``htr_envs.Trajectory``.
+
+    :param observations: (..., T, obs_dim) float32
+    :param actions: (..., T, action_dim) float32, in the bounds of the env's action space
+    :param next_observations: (..., T, obs_dim) float32
+    :param task_free_reward: (..., T) float32, the part of the reward that depends on no task
+    """
+
+    observations: np.ndarray
+    actions: np.ndarray
+    next_observations: np.ndarray
+    task_free_reward: np.ndarray
+
+
+class TaskFamily(Protocol):
+    """
+    What PEARL asks of an env's ``task_family``: a small picklable object without state.
+
+    It is a protocol, so that envs need not import ``sb3_htr``; ``htr_envs.TaskFamily`` fulfils it.
+    """
+
+    train_tasks: np.ndarray
+    validation_tasks: np.ndarray
+    test_tasks: np.ndarray
+
+    def compute_reward(self, traj: Any, task: np.ndarray, reward_type: str = "sparse") -> np.ndarray:
+        """Reward (..., T) float32 of each step of ``traj`` under ``task`` (..., task_dim)."""
+        ...
+
+    def is_success(self, traj: Any, task: np.ndarray) -> np.ndarray:
+        """Whether each step of ``traj`` solves ``task``: (..., T) bool."""
+        ...
+
+    def hindsight_task(self, traj: Any, index: Any) -> np.ndarray:
+        """The task (..., task_dim) that step ``index`` of ``traj`` solves."""
+        ...
+
+
+class MultiTaskSamples(NamedTuple):
+    """
+    One meta-batch of M tasks: C context transitions and B transitions for actor and critics per task.
+
+    All tensors are float32 on the buffer's device, unless said otherwise.
+
+    :param context: (M, C, obs_dim + action_dim + 1), rows (o, a, r)
+    :param context_mask: (M, C), 1 where a context row holds a transition, 0 where it is padding
+    :param observations: (M, B, obs_dim)
+    :param actions: (M, B, action_dim), scaled to [-1, 1]
+    :param next_observations: (M, B, obs_dim)
+    :param rewards: (M, B)
+    :param dones: (M, B), 1 where the episode terminated (time limits do not count)
+    :param task_ids: (M,) int array, the training task whose replay each row of the meta-batch came from
+    :param relabelled: (M,) bool array, whether context and RL batch carry rewards of a hindsight task
+    """
+
+    context: th.Tensor
+    context_mask: th.Tensor
+    observations: th.Tensor
+    actions: th.Tensor
+    next_observations: th.Tensor
+    rewards: th.Tensor
+    dones: th.Tensor
+    task_ids: np.ndarray
+    relabelled: np.ndarray

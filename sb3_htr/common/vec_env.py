@@ -1,0 +1,109 @@
+"""Batched task envs for Stable-Baselines3."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+
+
+class BatchedTaskVecEnv(VecEnv):
+    """
+    Presents a natively batched gymnasium ``VectorEnv`` of a task family as SB3 ``VecEnv``.
+
+    Tasks are set as in any VecEnv: ``set_options([{"task_id": i}, ...])`` (or ``{"task": vector}``), then ``reset()``.
+
+    :param vector_env: env with SAME_STEP autoreset (SB3 resets within the step that ends the episode)
+    """
+
+    def __init__(self, vector_env: VectorEnv) -> None:
+        mode = vector_env.metadata.get("autoreset_mode")
+        if mode != AutoresetMode.SAME_STEP:
+            raise ValueError(f"The vector env's autoreset_mode is {mode}, expected AutoresetMode.SAME_STEP.")
+        self.vector_env = vector_env
+        super().__init__(vector_env.num_envs, vector_env.single_observation_space, vector_env.single_action_space)
+
+    def reset(self) -> VecEnvObs:
+        # A batch has one random generator, so the first env's seed is the batch's
+        obs, info = self.vector_env.reset(seed=self._seeds[0], options=self._batch_options())
+        self.reset_infos = self._split(info)
+        self._reset_seeds()
+        self._reset_options()
+        return obs
+
+    def _batch_options(self) -> dict[str, Any] | None:
+        keys = {key for options in self._options for key in options}
+        if not keys:
+            return None
+        if any(options.keys() != keys for options in self._options):
+            raise ValueError(f"Envs of one batch need options with the same keys, got {sorted(keys)} in some of them only.")
+        return {key: np.array([options[key] for options in self._options]) for key in keys}
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        obs, rewards, terminated, truncated, info = self.vector_env.step(self._actions)
+        dones = terminated | truncated
+        final_obs = info.pop("final_obs", None)
+        infos = self._split(info)
+        for i in np.flatnonzero(dones):
+            infos[i]["terminal_observation"] = final_obs[i]
+            infos[i]["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
+        return obs, rewards, dones, infos
+
+    def _split(self, info: dict[str, Any]) -> list[dict[str, Any]]:
+        columns = [value.tolist() if value.ndim == 1 else list(value) for value in info.values()]
+        return [dict(zip(info, values, strict=True)) for values in zip(*columns, strict=True)]
+
+    def close(self) -> None:
+        self.vector_env.close()
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        return [getattr(self.vector_env, attr_name)] * len(self._get_indices(indices))
+
+    def has_attr(self, attr_name: str) -> bool:
+        return hasattr(self.vector_env, attr_name)
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        setattr(self.vector_env, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
+        # One call serves the whole batch
+        return [getattr(self.vector_env, method_name)(*args, **kwargs)] * len(self._get_indices(indices))
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
+        return [False] * len(self._get_indices(indices))
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        return [None] * self.num_envs
+
+
+def make_task_vec_env(
+    env_id: str,
+    n_envs: int = 1,
+    seed: int | None = None,
+    monitor_file: str | None = None,
+    env_kwargs: dict[str, Any] | None = None,
+) -> VecEnv:
+    """
+    Make ``n_envs`` copies of a registered task env: natively batched where its registration offers that, else one by one.
+
+    :param env_id: a registered id; ``"module:id"`` imports the module first
+    :param n_envs: number of envs stepped together
+    :param seed: seed of the envs' own randomness
+    :param monitor_file: where to write episode returns (CSV), nowhere by default
+    :param env_kwargs: arguments of the env
+    :return: a monitored VecEnv
+    """
+    spec = gym.spec(env_id)
+    if spec.vector_entry_point is None:
+        return make_vec_env(env_id, n_envs, seed=seed, monitor_dir=monitor_file, env_kwargs=env_kwargs)
+    vector_env = gym.make_vec(env_id, n_envs, vectorization_mode="vector_entry_point", **(env_kwargs or {}))
+    venv = VecMonitor(BatchedTaskVecEnv(vector_env), monitor_file, info_keywords=("is_success",))
+    venv.seed(seed)
+    return venv

@@ -1,0 +1,107 @@
+"""Whole episodes of all tasks in one contiguous array."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class EpisodeIndex(NamedTuple):
+    """
+    The stored transitions as one virtual list, ordered by task and within a task from the oldest to the newest episode.
+
+    Ranges are half-open and follow numpy's convention: task i owns rows ``task_row[i]:task_row[i + 1]``.
+
+    :param rows: (n_transitions,) int, position of each transition in ``EpisodeStore.rows``
+    :param episode_row: (n_episodes + 1,) int, first virtual row of each episode
+    :param task_episode: (n_tasks + 1,) int, first episode of each task
+    :param task_row: (n_tasks + 1,) int, first virtual row of each task
+    :param tasks: (k,) int, the tasks that have at least one episode
+    """
+
+    rows: np.ndarray
+    episode_row: np.ndarray
+    task_episode: np.ndarray
+    task_row: np.ndarray
+    tasks: np.ndarray
+
+
+class EpisodeStore:
+    """
+    One float32 array of slots; a slot holds one episode, and each task owns a ring of slots.
+
+    Slots are allocated when first needed and the array grows by doubling, so an empty store costs nothing.
+
+    :param n_tasks: number of tasks
+    :param episodes_per_task: capacity of each task's ring, in episodes; then the oldest episode is overwritten
+    :param episode_length: largest number of steps of an episode
+    :param row_dim: number of columns of a transition
+    """
+
+    def __init__(self, n_tasks: int, episodes_per_task: int, episode_length: int, row_dim: int) -> None:
+        self.n_tasks = n_tasks
+        self.episodes_per_task = episodes_per_task
+        self.episode_length = episode_length
+        self.n_added = np.zeros(n_tasks, dtype=np.int64)
+        self._slots = np.full((n_tasks, episodes_per_task), -1, dtype=np.int64)
+        self._n_slots = 0
+        self._lengths = np.zeros(0, dtype=np.int64)
+        self._data = np.zeros((0, episode_length, row_dim), dtype=np.float32)
+        self._index: EpisodeIndex | None = None
+
+    @property
+    def rows(self) -> np.ndarray:
+        """All slots as (n_slots * episode_length, row_dim); see :class:`EpisodeIndex` for the rows that hold data."""
+        return self._data.reshape(-1, self._data.shape[-1])
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of memory allocated for transitions."""
+        return self._data.nbytes
+
+    def add(self, task: int, episode: np.ndarray) -> None:
+        """
+        Append an episode to a task's ring.
+
+        :param task: task index
+        :param episode: (length, row_dim) float32
+        """
+        position = self.n_added[task] % self.episodes_per_task
+        slot = self._slots[task, position]
+        if slot < 0:
+            slot = self._slots[task, position] = self._allocate()
+        self._data[slot, : len(episode)] = episode
+        self._lengths[slot] = len(episode)
+        self.n_added[task] += 1
+        self._index = None
+
+    def _allocate(self) -> int:
+        if self._n_slots == len(self._data):
+            n_slots = min(max(16, 2 * len(self._data)), self.n_tasks * self.episodes_per_task)
+            data = np.zeros((n_slots, *self._data.shape[1:]), dtype=np.float32)
+            data[: self._n_slots] = self._data
+            self._data = data
+            self._lengths = np.append(self._lengths, np.zeros(n_slots - len(self._lengths), dtype=np.int64))
+        self._n_slots += 1
+        return self._n_slots - 1
+
+    def index(self) -> EpisodeIndex:
+        """
+        :return: the index of what is stored now; rebuilt only after an ``add``
+        """
+        if self._index is None:
+            count = np.minimum(self.n_added, self.episodes_per_task)
+            age = np.arange(count.max(initial=0))
+            position = ((self.n_added - count)[:, None] + age) % self.episodes_per_task
+            slots = np.take_along_axis(self._slots, position, axis=1)[age < count[:, None]]
+            lengths = self._lengths[slots]
+            task_episode = np.concatenate([[0], np.cumsum(count)])
+            episode_row = np.concatenate([[0], np.cumsum(lengths)])
+            step = np.arange(episode_row[-1]) - np.repeat(episode_row[:-1], lengths)
+            self._index = EpisodeIndex(
+                rows=np.repeat(slots * self.episode_length, lengths) + step,
+                episode_row=episode_row,
+                task_episode=task_episode,
+                task_row=episode_row[task_episode],
+                tasks=np.flatnonzero(count),
+            )
+        return self._index

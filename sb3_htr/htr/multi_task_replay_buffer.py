@@ -1,0 +1,316 @@
+"""Task-indexed replay with Single Episode Relabelling (SER) at sample time."""
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_htr.common.type_aliases import MultiTaskSamples, TaskFamily, Trajectory
+from sb3_htr.htr.episode_store import EpisodeStore
+from sb3_htr.htr.hindsight_task import HindsightTaskStrategy, select_step, to_hindsight_task_strategy
+
+
+def spread(rng: np.random.Generator, start: np.ndarray, length: np.ndarray, size: np.ndarray, width: int) -> np.ndarray:
+    """
+    Draw integers of ranges, evenly spread: one from each of ``size`` equal parts of the range.
+
+    Every integer has the same chance to be drawn, and none is drawn twice while ``size <= length``: a product of Gaussians
+    would count a duplicate in the context as evidence.
+
+    :param rng: source of randomness
+    :param start: (n,) int, first integer of each range
+    :param length: (n,) int, number of integers in each range
+    :param size: (n,) int, how many to draw from each range, at most ``width``
+    :param width: number of columns of the result
+    :return: (n, width) int; columns from ``size`` on repeat the last draw
+    """
+    part = np.minimum(np.arange(width), size[:, None] - 1)
+    position = (part + rng.random((len(start), width))) * (length / size)[:, None]
+    return start[:, None] + np.minimum(position.astype(np.int64), length[:, None] - 1)
+
+
+class MultiTaskReplayBuffer(ReplayBuffer):
+    """
+    Replay buffer of a family of tasks, with hindsight task relabelling in :meth:`sample`.
+
+    A transition's task is ``infos[i]["task_id"]``; an episode becomes visible to :meth:`sample` when it is complete.
+
+    Single Episode Relabelling (HTR paper, B.2): with probability K, a row of the meta-batch takes ONE episode of its task's
+    replay, ONE hindsight task that this episode reached, and both context and RL batch are steps of that episode with the
+    rewards of that task. (Algorithm 2, line 12 of the paper has the comparison with K inverted; A.2 and B.3 call K the
+    probability of relabelling, which is what it is here.)
+
+    :param buffer_size: capacity in transitions, shared equally by all training tasks
+    :param observation_space: Box
+    :param action_space: Box
+    :param device: where samples are put
+    :param n_envs: number of envs that :meth:`add` receives
+    :param optimize_memory_usage: for SB3's signature; must be False, episodes are stored whole
+    :param task_family: the env's ``task_family``: reward hook and training tasks
+    :param max_episode_steps: time limit of the env
+    :param relabel_probability: K, in [0, 1]. K = 0 is plain PEARL, bit for bit. The default was chosen by measurement
+        (the paper sweeps .1 to 1 and does not name its best)
+    :param hindsight_task_strategy: which state of the episode is the hindsight task, ``"random"`` (default; our choice, the
+        paper says "e.g., select a state reached") or ``"final"``
+    :param rl_batch_source: ``"episode"`` (B.2, default) draws the RL batch of a relabelled row from the same episode as its
+        context; ``"task"`` is the ablation of B.2, the RL batch comes from all of the task's replay
+    :param rl_reward_type: ``"sparse"``, or ``"dense"`` for the oracle baseline: RL batches carry the dense proxy reward of
+        their task while the context stays sparse
+    :param context_episodes: without relabelling, the context is drawn from this many latest episodes of the task (PEARL
+        draws context from recently collected data)
+    :param seed: seed of the buffer's own random generators
+    """
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        device: th.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        *,
+        task_family: TaskFamily,
+        max_episode_steps: int,
+        relabel_probability: float = 0.8,
+        hindsight_task_strategy: HindsightTaskStrategy | str = "random",
+        rl_batch_source: str = "episode",
+        rl_reward_type: str = "sparse",
+        context_episodes: int = 10,
+        seed: int | None = None,
+    ) -> None:
+        if not 0 <= relabel_probability <= 1:
+            raise ValueError(f"relabel_probability is {relabel_probability}, expected a number from 0 to 1.")
+        if rl_batch_source not in ("episode", "task"):
+            raise ValueError(f'rl_batch_source is {rl_batch_source!r}, expected "episode" or "task".')
+        if rl_reward_type not in ("sparse", "dense"):
+            raise ValueError(f'rl_reward_type is {rl_reward_type!r}, expected "sparse" or "dense".')
+        if context_episodes < 1:
+            raise ValueError(f"context_episodes is {context_episodes}, expected at least 1.")
+        if optimize_memory_usage:
+            raise ValueError("optimize_memory_usage is not supported: MultiTaskReplayBuffer stores whole episodes.")
+        n_tasks = len(task_family.train_tasks)
+        episodes_per_task = buffer_size // (n_tasks * max_episode_steps)
+        if episodes_per_task < 1:
+            raise ValueError(
+                f"buffer_size is {buffer_size}, too small for one episode of {max_episode_steps} steps for each of "
+                f"{n_tasks} training tasks: expected at least {n_tasks * max_episode_steps}."
+            )
+        # ReplayBuffer's own constructor would allocate everything at once
+        BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_envs)
+        self.optimize_memory_usage = False
+        self.handle_timeout_termination = True
+        self.task_family = task_family
+        self.max_episode_steps = max_episode_steps
+        self.relabel_probability = relabel_probability
+        self.hindsight_task_strategy = to_hindsight_task_strategy(hindsight_task_strategy)
+        self.rl_batch_source = rl_batch_source
+        self.rl_reward_type = rl_reward_type
+        self.context_episodes = context_episodes
+        self.obs_dim = int(np.prod(observation_space.shape or ()))
+        # Columns of a transition. (o, a, r) come first: they are what the context encoder sees.
+        o, a = self.obs_dim, self.action_dim
+        self._obs, self._action, self._reward = slice(0, o), slice(o, o + a), o + a
+        self._next_obs = slice(o + a + 1, 2 * o + a + 1)
+        self._task_free_reward, self._done = 2 * o + a + 1, 2 * o + a + 2
+        self.episodes = EpisodeStore(n_tasks, episodes_per_task, max_episode_steps, 2 * o + a + 3)
+        self._open = np.zeros((n_envs, max_episode_steps, 2 * o + a + 3), dtype=np.float32)
+        self._open_length = np.zeros(n_envs, dtype=np.int64)
+        self._open_task = np.full(n_envs, -1, dtype=np.int64)
+        self.seed(seed)
+
+    def seed(self, seed: int | None) -> None:
+        """
+        :param seed: seed of the two generators. Relabelling has its own, so that K = 0 changes nothing else.
+        """
+        sequence = np.random.SeedSequence(seed)
+        self._rng, self._relabel_rng = (np.random.default_rng(child) for child in sequence.spawn(2))
+
+    @property
+    def n_episodes(self) -> np.ndarray:
+        """(n_tasks,) int, complete episodes stored for each training task."""
+        return np.diff(self.episodes.index().task_episode)
+
+    @property
+    def reward_column(self) -> int:
+        return self._reward
+
+    def size(self) -> int:
+        """
+        :return: number of stored transitions, unfinished episodes not counted
+        """
+        return int(self.episodes.index().task_row[-1])
+
+    def add(
+        self,
+        obs: np.ndarray,
+        next_obs: np.ndarray,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """
+        Store one step of each env.
+
+        :param obs: (n_envs, obs_dim)
+        :param next_obs: (n_envs, obs_dim), the terminal observation where an episode ended
+        :param action: (n_envs, action_dim), scaled to [-1, 1]
+        :param reward: (n_envs,)
+        :param done: (n_envs,)
+        :param infos: one dict per env with ``task_id`` and ``task_free_reward``
+        :raises ValueError: NaN or infinite values, a task id that is no training task, a task that changed within an episode,
+            an episode longer than the time limit
+        """
+        task = np.array([info.get("task_id", -1) for info in infos], dtype=np.int64)
+        timeout = np.array([info.get("TimeLimit.truncated", False) for info in infos])
+        env, step = np.arange(self.n_envs), self._open_length
+        if (bad := (task < 0) | (task >= self.episodes.n_tasks)).any():
+            raise ValueError(
+                f"info['task_id'] is {infos[int(bad.argmax())].get('task_id')}, expected a training task from 0 to "
+                f"{self.episodes.n_tasks - 1}: only training tasks may enter the replay buffer."
+            )
+        if (bad := (step > 0) & (task != self._open_task)).any():
+            i = int(bad.argmax())
+            raise ValueError(
+                f"The task of env {i} changed from {self._open_task[i]} to {task[i]} within an episode: change tasks at reset."
+            )
+        if (step >= self.max_episode_steps).any():
+            raise ValueError(f"An episode is longer than the env's time limit of {self.max_episode_steps} steps.")
+        self._open[env, step, self._obs] = np.reshape(obs, (self.n_envs, -1))
+        self._open[env, step, self._action] = np.reshape(action, (self.n_envs, -1))
+        self._open[env, step, self._reward] = reward
+        self._open[env, step, self._next_obs] = np.reshape(next_obs, (self.n_envs, -1))
+        self._open[env, step, self._task_free_reward] = [info.get("task_free_reward", 0.0) for info in infos]
+        self._open[env, step, self._done] = done & ~timeout
+        if not np.isfinite(self._open[env, step]).all():
+            self._raise_not_finite(self._open[env, step], task)
+        self._open_task = task
+        self._open_length = step + 1
+        for i in np.flatnonzero(done):
+            self.episodes.add(task[i], self._open[i, : self._open_length[i]])
+            self._open_length[i] = 0
+
+    def _raise_not_finite(self, rows: np.ndarray, task: np.ndarray) -> None:
+        i = int((~np.isfinite(rows)).any(axis=1).argmax())
+        columns = {
+            "observation": self._obs,
+            "action": self._action,
+            "reward": self._reward,
+            "next observation": self._next_obs,
+            "task_free_reward": self._task_free_reward,
+        }
+        name = next(name for name, column in columns.items() if not np.isfinite(rows[i, column]).all())
+        raise ValueError(f"The {name} of task {task[i]} (env {i}) is {rows[i, columns[name]]}, expected finite numbers.")
+
+    def discard_open_episodes(self) -> None:
+        """Forget unfinished episodes; to be called when the envs are reset before their episodes end."""
+        self._open_length = np.zeros(self.n_envs, dtype=np.int64)
+
+    def reset(self) -> None:
+        """Remove all episodes."""
+        store = self.episodes
+        self.episodes = EpisodeStore(store.n_tasks, store.episodes_per_task, store.episode_length, store.rows.shape[1])
+        self.discard_open_episodes()
+
+    def trajectory(self, rows: np.ndarray) -> Trajectory:
+        """
+        :param rows: (..., T, row_dim) stored transitions
+        :return: what the reward hook needs of them
+        """
+        return Trajectory(
+            observations=rows[..., self._obs],
+            actions=self._unscale(rows[..., self._action]),
+            next_observations=rows[..., self._next_obs],
+            task_free_reward=rows[..., self._task_free_reward],
+        )
+
+    def _unscale(self, action: np.ndarray) -> np.ndarray:
+        low, high = self.action_space.low.ravel(), self.action_space.high.ravel()  # type: ignore[attr-defined]
+        if (low == -1).all() and (high == 1).all():
+            return action
+        return low + 0.5 * (action + 1.0) * (high - low)
+
+    def sample(  # type: ignore[override]
+        self,
+        batch_size: int,
+        env: VecNormalize | None = None,
+        *,
+        meta_batch_size: int = 16,
+        context_size: int = 64,
+    ) -> MultiTaskSamples:
+        """
+        Draw a meta-batch: tasks with replacement (as PEARL's reference does), and for each of them context and RL batch.
+
+        :param batch_size: transitions per task for actor and critics, B
+        :param env: normalizes observations, if given
+        :param meta_batch_size: number of tasks, M
+        :param context_size: transitions per task for the context, C; where the episodes drawn from hold fewer, all of them
+            and padding
+        :return: the meta-batch
+        :raises ValueError: if no episode is complete yet, or the reward hook returns NaN or infinity
+        """
+        index = self.episodes.index()
+        if len(index.tasks) == 0:
+            raise ValueError("The replay buffer holds no complete episode of any task: collect some before sampling.")
+        tasks = index.tasks[self._rng.integers(len(index.tasks), size=meta_batch_size)]
+        # Plain PEARL: RL batch from all of the task's replay, context from its latest episodes
+        start, end = index.task_row[tasks], index.task_row[tasks + 1]
+        latest = np.maximum(index.task_episode[tasks + 1] - self.context_episodes, index.task_episode[tasks])
+        rl = spread(self._rng, start, end - start, np.full(meta_batch_size, batch_size), batch_size)
+        context, context_length = self._draw_context(self._rng, index.episode_row[latest], end, context_size)
+        # SER: overwrite some rows of the meta-batch by steps of one episode
+        relabelled = self._relabel_rng.random(meta_batch_size) < self.relabel_probability
+        reward_task = self.task_family.train_tasks[tasks]
+        if relabelled.any():
+            rng, task = self._relabel_rng, tasks[relabelled]
+            n_episodes = index.task_episode[task + 1] - index.task_episode[task]
+            episode = index.task_episode[task] + (rng.random(len(task)) * n_episodes).astype(np.int64)
+            start, end = index.episode_row[episode], index.episode_row[episode + 1]
+            context[relabelled], context_length[relabelled] = self._draw_context(rng, start, end, context_size)
+            if self.rl_batch_source == "episode":
+                rl[relabelled] = spread(rng, start, end - start, np.full(len(task), batch_size), batch_size)
+            step = start + select_step(self.hindsight_task_strategy, end - start, rng)
+            reached = self.trajectory(self.episodes.rows[index.rows[step]][:, None])
+            reward_task[relabelled] = self.task_family.hindsight_task(reached, 0)
+        rows = self.episodes.rows[index.rows[np.concatenate([context, rl], axis=1)]]
+        if relabelled.any():
+            self._write_rewards(rows, relabelled, slice(None), reward_task, "sparse")
+        if self.rl_reward_type == "dense":
+            self._write_rewards(rows, np.full(meta_batch_size, True), slice(context_size, None), reward_task, "dense")
+        if env is not None:
+            for column in (self._obs, self._next_obs):
+                rows[..., column] = env.normalize_obs(rows[..., column])
+        context_mask = (np.arange(context_size) < context_length[:, None]).astype(np.float32)
+        batch, mask = self.to_torch(rows, copy=False), self.to_torch(context_mask, copy=False)
+        return MultiTaskSamples(
+            context=batch[:, :context_size, : self._reward + 1],
+            context_mask=mask,
+            observations=batch[:, context_size:, self._obs],
+            actions=batch[:, context_size:, self._action],
+            next_observations=batch[:, context_size:, self._next_obs],
+            rewards=batch[:, context_size:, self._reward],
+            dones=batch[:, context_size:, self._done],
+            task_ids=tasks,
+            relabelled=relabelled,
+        )
+
+    @staticmethod
+    def _draw_context(
+        rng: np.random.Generator, start: np.ndarray, end: np.ndarray, context_size: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        length = np.minimum(end - start, context_size)
+        return spread(rng, start, end - start, length, context_size), length
+
+    def _write_rewards(
+        self, rows: np.ndarray, where: np.ndarray, steps: slice, task: np.ndarray, reward_type: str
+    ) -> None:
+        """Give ``rows[where, steps]`` the reward of ``task[where]``, in one call of the reward hook."""
+        traj = self.trajectory(rows[where, steps])
+        reward = self.task_family.compute_reward(traj, task[where], reward_type=reward_type)
+        if not np.isfinite(reward).all():
+            raise ValueError("compute_reward returned NaN or infinity for a hindsight task, expected finite rewards.")
+        rows[where, steps, self._reward] = reward

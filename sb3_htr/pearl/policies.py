@@ -1,0 +1,191 @@
+"""Networks of PEARL: SAC's actor and critics conditioned on the task variable z, and the context encoder."""
+
+import math
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BaseModel
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.sac.policies import SACPolicy
+from torch import nn
+from torch.nn import functional as F
+
+from sb3_htr.pearl.encoder import ContextEncoder
+from sb3_htr.pearl.exploration import LatentPrior
+
+
+class EnsembleLinear(nn.Module):
+    """
+    ``n_members`` linear layers evaluated in one batched product.
+
+    :param n_members: number of independent layers
+    :param in_features: input units
+    :param out_features: output units
+    """
+
+    def __init__(self, n_members: int, in_features: int, out_features: int) -> None:
+        super().__init__()
+        # The distribution that nn.Linear starts from
+        bound = 1 / math.sqrt(in_features)
+        self.weight = nn.Parameter(th.empty(n_members, in_features, out_features).uniform_(-bound, bound))
+        self.bias = nn.Parameter(th.empty(n_members, 1, out_features).uniform_(-bound, bound))
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        return th.baddbmm(self.bias, x, self.weight)
+
+
+class LatentCritic(BaseModel):
+    """
+    Ensemble of Q(o, a, z) networks with layer normalization, which keeps the bootstrapped targets of unseen z bounded.
+
+    :param observation_space: space of (o, z)
+    :param action_space: Box
+    :param net_arch: hidden units per layer
+    :param activation_fn: activation between layers
+    :param n_critics: number of networks
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Box,
+        action_space: spaces.Box,
+        net_arch: list[int],
+        activation_fn: type[nn.Module] = nn.ReLU,
+        n_critics: int = 2,
+    ) -> None:
+        super().__init__(observation_space, action_space)
+        self.n_critics = n_critics
+        units = [observation_space.shape[0] + action_space.shape[0], *net_arch]
+        self.layers = nn.ModuleList(EnsembleLinear(n_critics, i, o) for i, o in zip(units[:-1], units[1:], strict=True))
+        self.scales = nn.ParameterList(th.ones(n_critics, 1, o) for o in net_arch)
+        self.shifts = nn.ParameterList(th.zeros(n_critics, 1, o) for o in net_arch)
+        self.output = EnsembleLinear(n_critics, units[-1], 1)
+        self.activation = activation_fn()
+
+    def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """
+        :param obs: (n, obs_dim + latent_dim)
+        :param actions: (n, action_dim), scaled to [-1, 1]
+        :return: (n_critics, n)
+        """
+        x = th.cat([obs, actions], dim=1).expand(self.n_critics, -1, -1)
+        for layer, scale, shift in zip(self.layers, self.scales, self.shifts, strict=True):
+            x = layer(x)
+            x = self.activation(F.layer_norm(x, x.shape[-1:]) * scale + shift)
+        return self.output(x).squeeze(-1)
+
+
+class PEARLPolicy(SACPolicy):
+    """
+    Actor, critics and context encoder of PEARL.
+
+    :param observation_space: Box, without the task variable
+    :param action_space: Box
+    :param lr_schedule: learning rate
+    :param net_arch: hidden units of actor and critics (paper A.2: ``[300, 300, 300]``)
+    :param encoder_arch: hidden units of the context encoder (paper A.2: ``[200, 200, 200]``)
+    :param latent_dim: dimension of z (paper A.2: 5)
+    :param activation_fn: activation of all networks
+    :param n_critics: number of critics
+    :param optimizer_class: optimizer of all networks
+    :param optimizer_kwargs: its arguments, without the learning rate
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Box,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | None = None,
+        encoder_arch: list[int] | None = None,
+        latent_dim: int = 5,
+        activation_fn: type[nn.Module] = nn.ReLU,
+        n_critics: int = 2,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+    ) -> None:
+        if latent_dim < 1:
+            raise ValueError(f"latent_dim is {latent_dim}, expected at least 1.")
+        self.latent_dim = latent_dim
+        self.encoder_arch = [128, 128] if encoder_arch is None else encoder_arch
+        obs_dim = int(np.prod(observation_space.shape))
+        self.context_dim = obs_dim + int(np.prod(action_space.shape)) + 1
+        # SB3's networks are built for the observation (o, z)
+        super().__init__(
+            spaces.Box(-np.inf, np.inf, (obs_dim + latent_dim,), np.float32),  # type: ignore[arg-type]
+            action_space,
+            lr_schedule,
+            net_arch=[128, 128] if net_arch is None else net_arch,
+            activation_fn=activation_fn,
+            n_critics=n_critics,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+        )
+        self.observation_space = observation_space
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        self.encoder = ContextEncoder(self.context_dim, self.latent_dim, self.encoder_arch, self.activation_fn)
+        self.encoder.optimizer = self.optimizer_class(
+            self.encoder.parameters(),
+            lr=lr_schedule(1),  # type: ignore[call-arg]
+            **self.optimizer_kwargs,
+        )
+        self.latent_prior = LatentPrior(self.latent_dim)
+        # z of predict() calls without a state: the prior mean
+        self._z = th.zeros(1, self.latent_dim)
+        self.critic_target.requires_grad_(False)
+
+    def make_critic(self, features_extractor: nn.Module | None = None) -> LatentCritic:  # type: ignore[override]
+        kwargs = self.critic_kwargs
+        return LatentCritic(
+            kwargs["observation_space"],
+            kwargs["action_space"],
+            kwargs["net_arch"],
+            kwargs["activation_fn"],
+            kwargs["n_critics"],
+        ).to(self.device)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        keys = ("lr_schedule", "net_arch", "activation_fn", "n_critics", "optimizer_class", "optimizer_kwargs")
+        return dict(
+            observation_space=self.observation_space,
+            action_space=self.action_space,
+            encoder_arch=self.encoder_arch,
+            latent_dim=self.latent_dim,
+            **{key: data[key] for key in keys},
+        )
+
+    def predict(  # type: ignore[override]
+        self,
+        observation: np.ndarray,
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+        """
+        :param observation: (obs_dim,) or (n, obs_dim)
+        :param state: tuple of one array, z of each observation (n, latent_dim); None is the prior mean
+        :param episode_start: ignored: z lives longer than an episode
+        :param deterministic: mean action instead of a sample
+        :return: actions, and the state unchanged
+        """
+        z = np.zeros((1, self.latent_dim), dtype=np.float32) if state is None else state[0]
+        self._z = th.as_tensor(z, dtype=th.float32, device=self.device)
+        actions, _ = super().predict(observation, None, episode_start, deterministic)
+        return actions, (z,)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        assert isinstance(observation, th.Tensor)
+        obs = observation.flatten(1).float()
+        return self.actor(th.cat([obs, self._z.expand(len(obs), -1)], dim=1), deterministic)
+
+    def set_training_mode(self, mode: bool) -> None:
+        super().set_training_mode(mode)
+        self.encoder.train(mode)
+
+
+MlpPolicy = PEARLPolicy
