@@ -1,11 +1,347 @@
-"""Check that an environment keeps the promises of a task family."""
+"""Check that an environment keeps the promises of a task family, as ``check_env`` does for those of an environment."""
 
 from __future__ import annotations
 
-from typing import Any
+import copy
+import pickle
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+
+from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory
+
+MAX_STEPS = 200  # for an env without a time limit
+N_DRAWS = 30
+TASK_SETS = ("train_tasks", "validation_tasks", "test_tasks")
+HOOKS = ("sample_tasks", "compute_reward", "is_success", "hindsight_task")
 
 
-def check_task_env(env: gym.Env[Any, Any]) -> None:
-    """Placeholder until the next commit."""
+class Episode(NamedTuple):
+    """What one episode gave, T steps long."""
+
+    traj: Trajectory
+    rewards: FloatArray
+    successes: BoolArray
+    achieved_tasks: FloatArray
+    terminated: BoolArray
+    task_id: int
+
+
+def _require(kept: bool | np.bool_, sentence: str) -> None:
+    # not an assert statement, which python -O would skip
+    if not kept:
+        raise AssertionError(sentence)
+
+
+def _call(sentence: str, function: Callable[..., Any], *args: Any) -> Any:
+    try:
+        return function(*args)
+    except Exception as error:
+        raise AssertionError(f"{sentence} It raised {error!r}.") from error
+
+
+def _same(first: ArrayLike, second: ArrayLike) -> bool:
+    # shapes must agree; a sum over many dimensions may round otherwise in a batch of another shape
+    return np.shape(first) == np.shape(second) and np.allclose(first, second, rtol=1e-5, atol=1e-6)
+
+
+def _select(traj: Trajectory, index: Any) -> Trajectory:
+    return Trajectory(*(values[index] for values in traj))
+
+
+def _check_interface(env: gym.Env[Any, Any]) -> TaskFamily:
+    base = env.unwrapped
+    for name in ("task_family", "set_task", "compute_reward", "hindsight_task", *TASK_SETS, "task_space"):
+        _require(hasattr(base, name), f"The env has no `{name}`: derive it from htr_envs.TaskEnv.")
+    family: TaskFamily = base.task_family  # type: ignore[attr-defined]
+    for name in (*HOOKS, *TASK_SETS, "task_space"):
+        _require(hasattr(family, name), f"The task family has no `{name}`: derive it from htr_envs.TaskFamily.")
+    for what, space in (("observation_space", env.observation_space), ("action_space", env.action_space)):
+        flat = isinstance(space, spaces.Box) and len(space.shape) == 1 and space.dtype == np.float32
+        _require(flat, f"The {what} is {space}, it must be a one-dimensional float32 Box.")
+    return family
+
+
+def _check_task_array(tasks: Any, family: TaskFamily, name: str) -> None:
+    task_dim = family.task_space.shape
+    shaped = isinstance(tasks, np.ndarray) and tasks.dtype == np.float32 and tasks.ndim == 2 and tasks.shape[1:] == task_dim
+    _require(shaped and len(tasks) > 0, f"{name} must be a float32 array (n, task_dim) of at least one task.")
+    _require(all(family.task_space.contains(task) for task in tasks), f"{name} has a task that is not in the task space.")
+
+
+def _check_family(family: TaskFamily) -> None:
+    flat = isinstance(family.task_space, spaces.Box) and len(family.task_space.shape) == 1
+    _require(flat, f"The task space is {family.task_space}, it must be a one-dimensional Box.")
+    seen: set[tuple[float, ...]] = set()
+    for name in TASK_SETS:
+        tasks = getattr(family, name)
+        _check_task_array(tasks, family, name)
+        _require(not tasks.flags.writeable, f"{name} can be written to: call its setflags(write=False).")
+        keys = {tuple(task) for task in tasks.tolist()}
+        _require(not keys & seen, f"{name} shares a task with another set: train must not meet validation or test.")
+        seen |= keys
+    drawn = [family.sample_tasks(5, np.random.default_rng(0)) for _ in range(2)]
+    _check_task_array(drawn[0], family, "What sample_tasks returned")
+    _require(len(drawn[0]) == 5, f"sample_tasks(5, rng) returned {len(drawn[0])} tasks instead of 5.")
+    _require(_same(*drawn), "sample_tasks draws from another source than the generator that it is given.")
+    twin = _call("The task family cannot be pickled.", lambda: pickle.loads(pickle.dumps(family)))
+    for name in TASK_SETS:
+        _require(_same(getattr(twin, name), getattr(family, name)), f"The pickled task family has other {name}.")
+
+
+def _check_step(env: gym.Env[Any, Any], family: TaskFamily, observation: Any, reward: Any, info: dict[str, Any]) -> None:
+    seen = isinstance(observation, np.ndarray) and observation.dtype == np.float32 and bool(np.isfinite(observation).all())
+    _require(
+        seen and observation in env.observation_space, f"The observation {observation!r} is not in the space, or not finite."
+    )
+    _require(isinstance(reward, float) and bool(np.isfinite(reward)), f"The reward {reward!r} is not a finite float.")
+    for key, kind in (("task_id", int), ("is_success", bool), ("achieved_task", np.ndarray), ("task_free_reward", float)):
+        _require(key in info, f"The info of step lacks `{key}`.")
+        _require(type(info[key]) is kind, f"info[{key!r}] is a {type(info[key]).__name__}, it must be a {kind.__name__}.")
+    _require(np.isfinite(info["task_free_reward"]), "info['task_free_reward'] is not finite.")
+    _check_task_array(info["achieved_task"][None], family, "info['achieved_task'][None]")
+
+
+def _play(
+    env: gym.Env[Any, Any],
+    family: TaskFamily,
+    seed: int,
+    task: FloatArray | None = None,
+    actions: FloatArray | None = None,
+    after_step: Callable[[], object] = lambda: None,
+) -> Episode:
+    action_space = copy.deepcopy(env.action_space)
+    action_space.seed(seed)
+    observation, info = env.reset(seed=seed, options=None if task is None else {"task": task})
+    _require(type(info.get("task_id")) is int, "The info of reset lacks `task_id`, or it is no int.")
+    task_id: int = info["task_id"]
+    rows: list[tuple[Any, ...]] = []
+    done = False
+    while not done and len(rows) < (MAX_STEPS if actions is None else len(actions)):
+        action = action_space.sample() if actions is None else actions[len(rows)]
+        next_observation, reward, terminated, truncated, info = env.step(action)
+        _check_step(env, family, next_observation, reward, info)
+        _require(info["task_id"] == task_id, f"The task changed within an episode, from {task_id} to {info['task_id']}.")
+        achieved_task = info["achieved_task"]
+        fresh = not rows or not np.shares_memory(achieved_task, rows[-1][-2])
+        _require(fresh, "info['achieved_task'] is the same memory at each step: return a copy.")
+        free = info["task_free_reward"]
+        rows.append((observation, action, next_observation, free, reward, info["is_success"], achieved_task, terminated))
+        observation, done = next_observation, terminated or truncated
+        after_step()
+    columns = [np.array(column) for column in zip(*rows, strict=True)]
+    traj = Trajectory(columns[0], columns[1], columns[2], columns[3].astype(np.float32))
+    return Episode(traj, columns[4].astype(np.float32), columns[5], columns[6], columns[7], task_id)
+
+
+def _check_rewards(env: gym.Env[Any, Any], family: TaskFamily, episode: Episode, task: FloatArray) -> None:
+    rewards = _call("compute_reward fails on an episode.", env.unwrapped.compute_reward, episode.traj, task)  # type: ignore[attr-defined]
+    shaped = isinstance(rewards, np.ndarray) and rewards.dtype == np.float32 and rewards.shape == episode.rewards.shape
+    _require(shaped, "compute_reward must return one float32 for each step, an array (..., T).")
+    _require(np.isfinite(rewards).all(), "compute_reward returned a number that is not finite.")
+    _require(_same(rewards, episode.rewards), "compute_reward does not give the rewards that step gave.")
+    successes = family.is_success(episode.traj, task)
+    shaped = isinstance(successes, np.ndarray) and successes.dtype == np.bool_
+    _require(shaped and _same(successes, episode.successes), "is_success does not give the info['is_success'] that step gave.")
+
+
+def _check_reward_types(family: TaskFamily, traj: Trajectory, task: FloatArray) -> None:
+    dense = _call("compute_reward has no reward type 'dense'.", family.compute_reward, traj, task, "dense")
+    finite = isinstance(dense, np.ndarray) and dense.dtype == np.float32 and bool(np.isfinite(dense).all())
+    _require(finite, "compute_reward with reward_type='dense' must return finite float32 numbers.")
+    try:
+        family.compute_reward(traj, task, "no such type")
+    except ValueError:
+        return
+    raise AssertionError("compute_reward takes an unknown reward_type: it must raise a ValueError.")
+
+
+def _check_vectorized(name: str, hook: Callable[[Trajectory, Any], Any], traj: Trajectory, tasks: FloatArray) -> None:
+    length = len(traj.task_free_reward)
+    rng = np.random.default_rng(0)
+    orders = [rng.permutation(length) for _ in tasks]
+    plain = hook(traj, tasks[0])
+    for pick in (orders[0], orders[0][: length // 2 + 1], orders[0][:1]):
+        chosen = _call(f"{name} fails on some steps of an episode.", hook, _select(traj, pick), tasks[0])
+        _require(_same(chosen, plain[pick]), f"{name} makes a step depend on other steps of the trajectory.")
+
+    vectorized = f"{name} is not vectorized: leading axes of trajectory and task must broadcast."
+    batch = _select(traj, np.stack(orders))
+    batch_of_batches = _select(traj, np.stack((orders, orders[::-1])))
+    cases = (
+        (batch, tasks, [hook(_select(batch, i), task) for i, task in enumerate(tasks)]),
+        (batch, tasks[0], [hook(_select(batch, i), tasks[0]) for i in range(len(tasks))]),
+        (traj, tasks, [hook(traj, task) for task in tasks]),
+        (
+            batch_of_batches,
+            tasks,
+            [[hook(_select(batch_of_batches, (j, i)), task) for i, task in enumerate(tasks)] for j in range(2)],
+        ),
+    )
+    for steps, task, expected in cases:
+        _require(_same(_call(vectorized, hook, steps, task), expected), vectorized)
+
+
+def _check_pure(family: TaskFamily, traj: Trajectory, tasks: FloatArray) -> None:
+    def results() -> list[NDArray[Any]]:
+        rewards = [family.compute_reward(traj, tasks[0]), family.compute_reward(traj, tasks[1], "dense")]
+        return [*rewards, family.is_success(traj, tasks[0]), family.hindsight_task(traj, 0)]
+
+    arguments = [*traj, tasks]
+    before = [values.copy() for values in arguments]
+    first, second = results(), results()
+    unchanged = all(np.array_equal(values, kept) for values, kept in zip(arguments, before, strict=True))
+    _require(unchanged, "A hook of the task family changes its arguments: it must be pure.")
+    repeated = all(map(_same, first, second))
+    _require(repeated, "A hook of the task family gives something else when it is called again: it must be pure.")
+
+
+def _check_hindsight(family: TaskFamily, episode: Episode) -> FloatArray:
+    traj, length = episode.traj, len(episode.rewards)
+    tasks = np.stack([_call("hindsight_task fails.", family.hindsight_task, traj, index) for index in range(length)])
+    _check_task_array(tasks, family, "What hindsight_task returned for each step")
+    _require(
+        not np.shares_memory(family.hindsight_task(traj, 0), traj.next_observations), "hindsight_task must return a copy."
+    )
+    _require(_same(tasks, episode.achieved_tasks), "info['achieved_task'] is not the hindsight_task of its step.")
+    for index, task in enumerate(tasks):
+        solved = bool(family.is_success(traj, task)[index])
+        _require(
+            solved, f"The state that hindsight_task was asked for does not solve it, at step {index} of a random episode."
+        )
+
+    vectorized = "hindsight_task is not vectorized: `index` must broadcast with the leading axes of the trajectory."
+    indices = np.array([0, length // 2, length - 1])
+    batch = _select(traj, np.stack([np.arange(length), np.roll(np.arange(length), 1), np.arange(length)[::-1]]))
+    cases: tuple[tuple[Trajectory, Any], ...] = ((batch, indices), (batch, length - 1), (traj, indices))
+    for steps, pick in cases:
+        rows = [_select(steps, i) if steps is batch else steps for i in range(3)]
+        expected = [family.hindsight_task(row, int(i)) for row, i in zip(rows, np.broadcast_to(pick, 3), strict=True)]
+        _require(_same(_call(vectorized, family.hindsight_task, steps, pick), expected), vectorized)
+    return tasks
+
+
+def _check_sparse(family: TaskFamily, traj: Trajectory, own_tasks: FloatArray) -> None:
+    tasks = np.concatenate((own_tasks, family.train_tasks))
+    task_rewards = family.compute_reward(traj, tasks) - traj.task_free_reward
+    failures = task_rewards[~family.is_success(traj, tasks)]
+    if len(failures) == 0:
+        return
+    slack = 1e-4 * (1.0 + np.abs(traj.task_free_reward).max() + np.abs(failures).max())
+    constant = np.ptp(failures) <= slack
+    _require(constant, "The sparse reward of an unsuccessful step depends on the task or the state: it must be one constant.")
+    worth = task_rewards[np.arange(len(own_tasks)), np.arange(len(own_tasks))]
+    _require((worth > failures.max() + slack).all(), "A step that solves its task exactly is worth no more than a failure.")
+
+
+def _check_no_leak(plain: Episode, other: Episode) -> None:
+    same_states = _same(plain.traj.observations, other.traj.observations)
+    same_states = same_states and _same(plain.traj.next_observations, other.traj.next_observations)
+    _require(same_states, "The task leaks into the observations: same seed and actions, another task, other observations.")
+    _require(_same(plain.terminated, other.terminated), "The task leaks into the terminations: they must not depend on it.")
+    same_free = _same(plain.traj.task_free_reward, other.traj.task_free_reward)
+    _require(same_free, "info['task_free_reward'] depends on the task.")
+
+
+def _check_episode(env: gym.Env[Any, Any], family: TaskFamily, seed: int) -> None:
+    base: Any = env.unwrapped
+    base.set_task(None)
+    plain = _play(env, family, seed)
+    in_range = 0 <= plain.task_id < len(family.train_tasks)
+    _require(in_range, f"An env that was given no task had task_id {plain.task_id}: it must draw a training task.")
+    _check_rewards(env, family, plain, family.train_tasks[plain.task_id])
+    traj = plain.traj
+    own_tasks = _check_hindsight(family, plain)
+    tasks = own_tasks[[0, len(own_tasks) // 2, -1]]
+    _check_pure(family, traj, tasks)
+    _check_reward_types(family, traj, tasks[0])
+
+    def dense_reward(steps: Trajectory, task: ArrayLike) -> FloatArray:
+        return family.compute_reward(steps, task, "dense")
+
+    _check_vectorized("compute_reward", family.compute_reward, traj, tasks)
+    _check_vectorized("compute_reward with 'dense'", dense_reward, traj, tasks)
+    _check_vectorized("is_success", family.is_success, traj, tasks)
+    _check_sparse(family, traj, own_tasks)
+
+    # Random episodes rarely see a sparse reward. The same episode again under a task that it solved has one for sure.
+    for task in tasks[1:]:
+        solved = _play(env, family, seed, task, traj.actions)
+        _require(solved.task_id == -1, f"A task given as a vector had task_id {solved.task_id}: it must be -1.")
+        _check_no_leak(plain, solved)
+        _require(solved.successes.any(), "reset does not honour options={'task': vector}: the episode does not solve it.")
+        _check_rewards(env, family, solved, task)
+
+        def use_hooks() -> None:
+            base.compute_reward(traj, own_tasks)
+            base.hindsight_task(traj, 0)
+
+        disturbed = _play(env, family, seed, task, traj.actions, use_hooks)
+        undisturbed = all(map(_same, (disturbed.rewards, *disturbed.traj), (solved.rewards, *solved.traj)))
+        _require(undisturbed, "Calling compute_reward or hindsight_task changes the env: the same episode went otherwise.")
+
+
+def _check_task_rules(env: gym.Env[Any, Any], family: TaskFamily) -> None:
+    base: Any = env.unwrapped
+    n_tasks = len(family.train_tasks)
+    last = n_tasks - 1
+
+    def ids(n_resets: int = 2) -> set[int]:
+        return {env.reset()[1]["task_id"] for _ in range(n_resets)}
+
+    base.set_task(None)
+    drawn = ids(N_DRAWS)
+    _require(len(drawn) > 1 or n_tasks == 1, "An env that was given no task must draw a new one at each reset.")
+    _, info = env.reset(options={"task_id": last})
+    _require(info["task_id"] == last, "reset does not honour options={'task_id': i}.")
+    _require(ids() == {last}, "A task given in the options of a reset does not stay over later resets.")
+    base.set_task(0)
+    info = env.step(env.action_space.sample())[-1]
+    _require(info["task_id"] == last, "set_task changes the task within an episode: it must wait for the next reset.")
+    _require(ids() == {0}, "A task id given to set_task does not stay over later resets.")
+    base.set_task(family.test_tasks[0])
+    _require(ids() == {-1}, "A task vector given to set_task does not stay over later resets with task_id -1.")
+    base.set_task(None)
+    drawn = ids(N_DRAWS)
+    _require(-1 not in drawn and (len(drawn) > 1 or n_tasks == 1), "set_task(None) does not go back to drawing tasks.")
+
+
+def _check_bad_options(env: gym.Env[Any, Any], family: TaskFamily) -> None:
+    bad: list[dict[str, Any]] = [
+        {"task_id": len(family.train_tasks)},
+        {"task_id": -1},
+        {"task": np.full_like(family.train_tasks[0], np.nan)},
+        {"task": family.train_tasks},
+        {"no_such_option": 0},
+    ]
+    for options in bad:
+        try:
+            env.reset(options=options)
+        except ValueError:
+            continue
+        except Exception as error:
+            raise AssertionError(f"reset(options={options}) raised {error!r}: it must raise a ValueError.") from error
+        raise AssertionError(f"reset takes options={options}: it must raise a ValueError.")
+
+
+def check_task_env(env: gym.Env[Any, Any], n_episodes: int = 3, seed: int = 0) -> None:
+    """Run random episodes and fail at the first promise of a task family that the env breaks.
+
+    The promises are those of :class:`htr_envs.TaskEnv` and :class:`htr_envs.TaskFamily`. Numbers are compared up to float32
+    rounding. Run gymnasium's ``check_env`` as well: this function does not repeat it. The env is left without a given task.
+
+    :param env: the env, wrapped or not; wrappers must not change observations, actions or rewards.
+    :param n_episodes: number of random episodes to check.
+    :param seed: seed of the first episode.
+    :raises AssertionError: with one sentence on the broken promise.
+    """
+    family = _check_interface(env)
+    _check_family(family)
+    for episode in range(n_episodes):
+        _check_episode(env, family, seed + episode)
+    _check_task_rules(env, family)
+    _check_bad_options(env, family)

@@ -14,10 +14,12 @@ BLACK = (0, 0, 0)
 GREY = (200, 200, 200)
 DARK_GREY = (110, 110, 110)
 ORANGE = (230, 159, 0)
+PALE_ORANGE = (250, 226, 170)
 BLUE = (0, 114, 178)
 WHITE = (255, 255, 255)
 
 Colour = tuple[int, int, int]
+FloatPoints = NDArray[np.float64]
 
 # Glyphs of 3 x 5 pixels, rows from top to bottom; a font library would be one more dependency for a dozen of signs.
 GLYPHS = {
@@ -54,37 +56,53 @@ class Canvas:
 
     def __init__(self, half_width: float) -> None:
         self.pixel = 2.0 * half_width / SIZE
+        self._half_width = half_width
         centers = (np.arange(SIZE) + 0.5) * self.pixel - half_width
         self._x, self._y = np.meshgrid(centers, centers[::-1])  # y grows upwards, rows grow downwards
         self._image = np.full((SIZE, SIZE, 3), 255.0)
 
-    def _blend(self, distance: NDArray[np.float64], colour: Colour, opacity: float) -> None:
+    def _window(self, points: FloatPoints, margin: float) -> tuple[slice, slice]:
+        # only the pixels near a shape are worth computing
+        left, bottom = (points.min(axis=0) - margin + self._half_width) / self.pixel - 1
+        right, top = (points.max(axis=0) + margin + self._half_width) / self.pixel + 1
+        left, right, first, last = np.clip((left, right, SIZE - top, SIZE - bottom), 0, SIZE).astype(int)
+        return slice(first, last), slice(left, right)
+
+    def _blend(self, window: tuple[slice, slice], distance: FloatPoints, colour: Colour, opacity: float = 1.0) -> None:
         # an edge is one pixel wide: full colour half a pixel inside (distance < 0), none half a pixel outside
         alpha = opacity * np.clip(0.5 - distance / self.pixel, 0.0, 1.0)[..., None]
-        self._image += alpha * (np.array(colour) - self._image)
-
-    def _distance_to(self, point: ArrayLike) -> NDArray[np.float64]:
-        x, y = np.asarray(point, dtype=np.float64)
-        distance: NDArray[np.float64] = np.hypot(self._x - x, self._y - y)
-        return distance
+        self._image[window] += alpha * (np.array(colour) - self._image[window])
 
     def disc(self, center: ArrayLike, radius: float, colour: Colour, opacity: float = 1.0) -> None:
         """Draw a filled circle."""
-        self._blend(self._distance_to(center) - radius, colour, opacity)
+        x, y = np.asarray(center, dtype=np.float64)
+        window = self._window(np.array([(x, y)]), radius)
+        self._blend(window, np.hypot(self._x[window] - x, self._y[window] - y) - radius, colour, opacity)
 
-    def circle(self, center: ArrayLike, radius: float, width: float, colour: Colour) -> None:
-        """Draw the outline of a circle."""
-        self._blend(np.abs(self._distance_to(center) - radius) - width / 2 * self.pixel, colour, 1.0)
+    def circle(self, center: ArrayLike, radius: float, width: float, colour: Colour, upper_half: bool = False) -> None:
+        """Draw the outline of a circle, or of its upper half."""
+        x, y = np.asarray(center, dtype=np.float64)
+        window = self._window(np.array([(x, y)]), radius + width * self.pixel)
+        distance = np.abs(np.hypot(self._x[window] - x, self._y[window] - y) - radius) - width / 2 * self.pixel
+        self._blend(window, np.maximum(distance, y - self._y[window]) if upper_half else distance, colour)
 
     def line(self, points: ArrayLike, width: float, colour: Colour) -> None:
         """Draw straight lines from point to point, (n, 2)."""
         vertices = np.asarray(points, dtype=np.float64)
-        nearest = self._distance_to(vertices[0])
+        window = self._window(vertices, width * self.pixel)
+        grid_x, grid_y = self._x[window], self._y[window]
+        nearest = np.hypot(grid_x - vertices[0, 0], grid_y - vertices[0, 1])
         for (x, y), (dx, dy) in zip(vertices[:-1], np.diff(vertices, axis=0), strict=True):
             # foot of the perpendicular, kept between the two ends; the tiny number is for a segment of length zero
-            along = np.clip(((self._x - x) * dx + (self._y - y) * dy) / (dx * dx + dy * dy + 1e-12), 0.0, 1.0)
-            nearest = np.minimum(nearest, np.hypot(self._x - x - along * dx, self._y - y - along * dy))
-        self._blend(nearest - width / 2 * self.pixel, colour, 1.0)
+            along = np.clip(((grid_x - x) * dx + (grid_y - y) * dy) / (dx * dx + dy * dy + 1e-12), 0.0, 1.0)
+            nearest = np.minimum(nearest, np.hypot(grid_x - x - along * dx, grid_y - y - along * dy))
+        self._blend(window, nearest - width / 2 * self.pixel, colour)
+
+    def cross(self, center: ArrayLike, size: float, colour: Colour) -> None:
+        """Draw an x; its size is in pixels."""
+        reach = size * self.pixel
+        for slope in (-1.0, 1.0):
+            self.line(np.asarray(center) + np.array([(-reach, -slope * reach), (reach, slope * reach)]), 2.5, colour)
 
     def text(self, point: ArrayLike, text: str, colour: Colour) -> None:
         """Write digits, minus and some capital letters, with the top left corner at a point."""
@@ -117,18 +135,17 @@ def draw_point_robot(path: FloatArray, goal: FloatArray, goal_distance: float, g
     canvas = Canvas(half_width)
     pixel = canvas.pixel
 
+    canvas.circle((0.0, 0.0), goal_distance, 3, PALE_ORANGE, upper_half=True)
     tick = 1 if half_width < 5.0 else 5
     canvas.line([(-half_width, 0.0), (half_width, 0.0)], 1, GREY)
     canvas.line([(0.0, -half_width), (0.0, half_width)], 1, GREY)
     for value in range(-2 * tick, 3 * tick, tick):
-        if value and abs(value) < half_width:
+        if value and abs(value) < 0.93 * half_width:  # nearer to the edge the label would be cut
             canvas.line([(value, -4 * pixel), (value, 4 * pixel)], 1, DARK_GREY)
             canvas.line([(-4 * pixel, value), (4 * pixel, value)], 1, DARK_GREY)
             canvas.text((value - 4 * pixel, -8 * pixel), str(value), DARK_GREY)
             canvas.text((8 * pixel, value + 5 * pixel), str(value), DARK_GREY)
 
-    angles = np.linspace(0.0, np.pi, 49)
-    canvas.line(goal_distance * np.stack((np.cos(angles), np.sin(angles)), axis=-1), 3, (250, 226, 170))
     reached = bool(np.hypot(*(path[-1] - goal)) < goal_radius)
     canvas.disc(goal, goal_radius, ORANGE, 1.0 if reached else 0.5)
     canvas.circle(goal, goal_radius, 2, ORANGE)
@@ -136,14 +153,15 @@ def draw_point_robot(path: FloatArray, goal: FloatArray, goal_distance: float, g
     canvas.line(path, 2, BLUE)
     for position in path[1:-1]:
         canvas.disc(position, 3 * pixel, BLUE)
-    marker = 6 * pixel
-    canvas.line(path[0] + np.array([(-marker, -marker), (marker, marker)]), 2.5, BLACK)
-    canvas.line(path[0] + np.array([(-marker, marker), (marker, -marker)]), 2.5, BLACK)
+    canvas.cross(path[0], 6, BLACK)
     canvas.disc(path[-1], 8 * pixel, WHITE)
     canvas.disc(path[-1], 7 * pixel, BLUE)
 
-    legend = np.array((-half_width, half_width)) + np.array((8 * pixel, -8 * pixel))
-    for row, (word, colour) in enumerate((("GOAL", ORANGE), ("START", BLACK), ("ROBOT", BLUE))):
-        canvas.disc(legend + np.array((5 * pixel, -(5 + 16 * row) * pixel)), 5 * pixel, colour)
-        canvas.text(legend + np.array((16 * pixel, -16 * row * pixel)), word, DARK_GREY)
+    left, top = -half_width + 8 * pixel, half_width - 8 * pixel
+    swatch = (left + 5 * pixel, top - 5 * pixel)
+    canvas.disc(swatch, 5 * pixel, ORANGE)
+    canvas.cross((swatch[0], swatch[1] - 16 * pixel), 4, BLACK)
+    canvas.disc((swatch[0], swatch[1] - 32 * pixel), 5 * pixel, BLUE)
+    for row, word in enumerate(("GOAL", "START", "ROBOT")):
+        canvas.text((left + 16 * pixel, top - 16 * row * pixel), word, DARK_GREY)
     return canvas.image()

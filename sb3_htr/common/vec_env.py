@@ -49,7 +49,8 @@ class BatchedTaskVecEnv(VecEnv):
     def step_wait(self) -> VecEnvStepReturn:
         obs, rewards, terminated, truncated, info = self.vector_env.step(self._actions)
         dones = terminated | truncated
-        final_obs = info.pop("final_obs", None)
+        final_obs = info.pop("final_obs")
+        info.pop("_final_obs", None)
         infos = self._split(info)
         for i in np.flatnonzero(dones):
             infos[i]["terminal_observation"] = final_obs[i]

@@ -47,6 +47,7 @@ class EpisodeStore:
         self._lengths = np.zeros(0, dtype=np.int64)
         self._data = np.zeros((0, episode_length, row_dim), dtype=np.float32)
         self._index: EpisodeIndex | None = None
+        self._new: list[int] = []
 
     @property
     def rows(self) -> np.ndarray:
@@ -73,6 +74,17 @@ class EpisodeStore:
         self._lengths[slot] = len(episode)
         self.n_added[task] += 1
         self._index = None
+        self._new.append(slot)
+
+    def take_new(self) -> tuple[np.ndarray, np.ndarray]:
+        """
+        :return: the episodes added since the last call (n, episode_length, row_dim), and their lengths (n,); rows beyond an
+            episode's length hold anything
+        """
+        # A slot that was overwritten since is listed twice
+        slots = np.unique(np.array(self._new, dtype=np.int64))
+        self._new = []
+        return self._data[slots], self._lengths[slots]
 
     def _allocate(self) -> int:
         if self._n_slots == len(self._data):

@@ -80,6 +80,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         rl_batch_source: str = "episode",
         rl_reward_type: str = "sparse",
         context_episodes: int = 10,
+        hindsight_context_episodes: int = 1,
         seed: int | None = None,
     ) -> None:
         if not 0 <= relabel_probability <= 1:
@@ -110,6 +111,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         self.rl_batch_source = rl_batch_source
         self.rl_reward_type = rl_reward_type
         self.context_episodes = context_episodes
+        self.hindsight_context_episodes = hindsight_context_episodes
         self.obs_dim = int(np.prod(observation_space.shape or ()))
         # Columns of a transition. (o, a, r) come first: they are what the context encoder sees.
         o, a = self.obs_dim, self.action_dim
@@ -135,8 +137,9 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         return np.diff(self.episodes.index().task_episode)
 
     @property
-    def reward_column(self) -> int:
-        return self._reward
+    def context_dim(self) -> int:
+        """Length of a context row (o, a, r), the first columns of a stored transition."""
+        return self._reward + 1
 
     def size(self) -> int:
         """
@@ -270,7 +273,10 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             n_episodes = index.task_episode[task + 1] - index.task_episode[task]
             episode = index.task_episode[task] + (rng.random(len(task)) * n_episodes).astype(np.int64)
             start, end = index.episode_row[episode], index.episode_row[episode + 1]
-            context[relabelled], context_length[relabelled] = self._draw_context(rng, start, end, context_size)
+            first, last = self._draw_window(episode, index.task_episode[task], index.task_episode[task + 1])
+            context[relabelled], context_length[relabelled] = self._draw_context(
+                rng, index.episode_row[first], index.episode_row[last], context_size
+            )
             if self.rl_batch_source == "episode":
                 rl[relabelled] = spread(rng, start, end - start, np.full(len(task), batch_size), batch_size)
             step = start + select_step(self.hindsight_task_strategy, end - start, rng)
@@ -287,7 +293,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         context_mask = (np.arange(context_size) < context_length[:, None]).astype(np.float32)
         batch, mask = self.to_torch(rows, copy=False), self.to_torch(context_mask, copy=False)
         return MultiTaskSamples(
-            context=batch[:, :context_size, : self._reward + 1],
+            context=batch[:, :context_size, : self.context_dim],
             context_mask=mask,
             observations=batch[:, context_size:, self._obs],
             actions=batch[:, context_size:, self._action],
@@ -297,6 +303,13 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             task_ids=tasks,
             relabelled=relabelled,
         )
+
+    def _draw_window(self, episode: np.ndarray, first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Some consecutive episodes of a task (half-open range ``first:last``), ``episode`` among them."""
+        length = self._relabel_rng.integers(1, self.hindsight_context_episodes + 1, size=len(episode))
+        before = (self._relabel_rng.random(len(episode)) * length).astype(np.int64)
+        start = np.maximum(episode - before, first)
+        return start, np.minimum(start + length, last)
 
     @staticmethod
     def _draw_context(

@@ -1,4 +1,4 @@
-"""Posterior sampling over the episodes of an adaptation, for several tasks at once."""
+"""Posterior sampling over the episodes of an adaptation, for several tasks side by side."""
 
 import numpy as np
 import torch as th
@@ -9,85 +9,93 @@ from sb3_htr.pearl.policies import PEARLPolicy
 
 class Adaptation:
     """
-    Adapts to one task per env from the episodes of this adaptation alone, one after the other.
+    Adapts to one task per env, from nothing but the episodes of this adaptation.
+
+    The z to act with is in :attr:`z`; feed every step to :meth:`observe`, and ``z`` changes where an episode ends.
 
     :param policy: networks
-    :param n_envs: number of tasks adapted to side by side
-    :param n_exploration_episodes: episodes before the posterior is used
-    :param explorer: how z is drawn while exploring
-    :param deterministic: use the posterior's mean instead of a sample
-    :param generator: source of randomness
+    :param n_envs: number of tasks
+    :param explorer: how z is drawn before the posterior is used
+    :param n_exploration_episodes: episodes before the posterior is used, for the explorer PRIOR
+    :param generator: source of randomness; torch's global one by default
     """
 
     def __init__(
         self,
         policy: PEARLPolicy,
         n_envs: int,
-        n_exploration_episodes: int,
         explorer: Explorer,
-        max_episode_steps: int,
+        n_exploration_episodes: int,
         generator: th.Generator | None = None,
-        context: str = "best",
     ) -> None:
         self.policy = policy
         self.explorer = explorer
         self.n_exploration_episodes = n_exploration_episodes
         self.generator = generator
-        self.context = context
         self.n_episodes = np.zeros(n_envs, dtype=np.int64)
-        self._rows = np.zeros((n_envs, 4 * max_episode_steps, policy.context_dim), dtype=np.float32)
-        self._start = np.zeros(n_envs, dtype=np.int64)
-        self._length = np.zeros(n_envs, dtype=np.int64)
-        self._best = np.zeros((n_envs, 2), dtype=np.int64)
-        self._best_return = np.full(n_envs, -np.inf)
+        # Return of the best episode, without the task-free part
+        self.best_return = np.zeros(n_envs, dtype=np.float64)
         self.z = np.zeros((n_envs, policy.latent_dim), dtype=np.float32)
+        self._rows = np.zeros((n_envs, 64, policy.context_dim), dtype=np.float32)
+        self._n_rows = np.zeros(n_envs, dtype=np.int64)
+        self._episode_start = np.zeros(n_envs, dtype=np.int64)
+        self._episode_return = np.zeros(n_envs, dtype=np.float64)
+        # Rows of the best episode, first and last + 1
+        self._best = np.zeros((n_envs, 2), dtype=np.int64)
         self._draw(np.arange(n_envs))
 
-    @property
-    def rewarded(self) -> np.ndarray:
-        return self._best_return > 0
-
-    def observe(self, obs: np.ndarray, action: np.ndarray, reward: np.ndarray, done: np.ndarray, goal_reward) -> None:
-        if self._length.max() == self._rows.shape[1]:
+    def observe(
+        self, obs: np.ndarray, actions: np.ndarray, rewards: np.ndarray, task_free_rewards: np.ndarray, dones: np.ndarray
+    ) -> None:
+        """
+        :param obs: (n_envs, obs_dim), what the actions were chosen for
+        :param actions: (n_envs, action_dim), scaled to [-1, 1]
+        :param rewards: (n_envs,)
+        :param task_free_rewards: (n_envs,), the part of the rewards that depends on no task
+        :param dones: (n_envs,), where an episode ended
+        """
+        n_envs = len(dones)
+        if self._n_rows.max() == self._rows.shape[1]:
             self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)], axis=1)
-        env = np.arange(len(done))
-        self._rows[env, self._length] = np.concatenate([obs.reshape(len(done), -1), action, reward[:, None]], axis=1)
-        self._length += 1
-        if not hasattr(self, "_ret"):
-            self._ret = np.zeros(len(done))
-        self._ret += goal_reward
-        if done.any():
-            finished = np.flatnonzero(done)
-            better = finished[self._ret[finished] > self._best_return[finished]]
-            self._best[better] = np.stack([self._start[better], self._length[better]], axis=1)
-            self._best_return[better] = self._ret[better]
-            self._ret[finished] = 0
-            self._start[finished] = self._length[finished]
-            self.n_episodes[finished] += 1
-            self._draw(finished)
+        row = np.concatenate([obs.reshape(n_envs, -1), actions, rewards[:, None]], axis=1)
+        self._rows[np.arange(n_envs), self._n_rows] = row
+        self._n_rows += 1
+        self._episode_return += rewards - task_free_rewards
+        ended = np.flatnonzero(dones)
+        if len(ended) == 0:
+            return
+        better = ended[self._episode_return[ended] > self.best_return[ended]]
+        self.best_return[better] = self._episode_return[better]
+        self._best[better] = np.stack([self._episode_start, self._n_rows], axis=1)[better]
+        self._episode_return[ended] = 0
+        self._episode_start[ended] = self._n_rows[ended]
+        self.n_episodes[ended] += 1
+        self._draw(ended)
+
+    def exploring(self) -> np.ndarray:
+        """
+        :return: (n_envs,) bool, whether z is still drawn by the explorer
+        """
+        if self.explorer is Explorer.PRIOR:
+            return self.n_episodes < self.n_exploration_episodes
+        return self.best_return <= 0
 
     def _draw(self, envs: np.ndarray) -> None:
+        """New z for some envs."""
         attempt = th.as_tensor(self.n_episodes[envs])
-        with th.no_grad():
-            z = self.policy.latent_prior.sample(self.explorer, attempt, self.generator)
-            if self.explorer is Explorer.PLAN:
-                posterior = self.rewarded[envs]
-            elif self.explorer is Explorer.AGGREGATE:
-                posterior = (self.n_episodes[envs] >= self.n_exploration_episodes) & self.rewarded[envs]
-            else:
-                posterior = self.n_episodes[envs] >= self.n_exploration_episodes
-            if posterior.any():
-                z[th.as_tensor(posterior)] = self._posterior(envs[posterior])
-        self.z[envs] = z.cpu().numpy()
+        explored = self.policy.latent_prior.sample(self.explorer, attempt, self.generator).cpu().numpy()
+        self.z[envs] = np.where(self.exploring()[envs, None], explored, self._sample_posterior(envs))
 
-    def _posterior(self, envs) -> th.Tensor:
-        step = np.arange(self._length[envs].max())
-        if self.context == "best":
-            mask = (step >= self._best[envs, :1]) & (step < self._best[envs, 1:])
+    def _sample_posterior(self, envs: np.ndarray) -> np.ndarray:
+        row = np.arange(self._n_rows[envs].max())
+        if self.explorer is Explorer.PRIOR:
+            mask = row < self._n_rows[envs, None]
         else:
-            mask = step < self._length[envs, None]
-        context = th.as_tensor(self._rows[envs, : len(step)])
-        mean, variance = self.policy.encoder(context, th.as_tensor(mask.astype(np.float32)))
-        if self.context == "best":
-            return mean
-        return mean + variance.sqrt() * th.randn(mean.shape, generator=self.generator)
+            # Meta-training sees contexts of one rewarded episode; the misses of a search would look like nothing it knows
+            mask = (row >= self._best[envs, :1]) & (row < self._best[envs, 1:])
+        device = self.policy.device
+        with th.no_grad():
+            context = th.as_tensor(self._rows[envs, : len(row)], device=device)
+            mean, variance = self.policy.encoder(context, th.as_tensor(mask, dtype=th.float32, device=device))
+        noise = th.randn(mean.shape, generator=self.generator)
+        return mean.cpu().numpy() + variance.sqrt().cpu().numpy() * noise.numpy()

@@ -1,165 +1,518 @@
-from typing import Any, ClassVar
+"""PEARL with hindsight task relabelling."""
+
+import io
+import pathlib
+import warnings
+from typing import Any, ClassVar, TypeVar
+
+import gymnasium as gym
 import numpy as np
 import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import RolloutReturn
-from stable_baselines3.common.utils import polyak_update
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule, TrainFreq
+from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.sac import SAC
-from torch.nn import functional as F
+
+from sb3_htr.common import checks
+from sb3_htr.common.evaluation import run_adaptation
+from sb3_htr.common.type_aliases import TaskFamily
 from sb3_htr.common.vec_env import make_task_vec_env
-from sb3_htr.htr import MultiTaskReplayBuffer
+from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.pearl.adaptation import Adaptation
-from sb3_htr.pearl.encoder import kl_to_prior
-from sb3_htr.pearl.exploration import Explorer, TaskBank
-from sb3_htr.pearl.policies import MlpPolicy
+from sb3_htr.pearl.adapted_agent import AdaptedAgent
+from sb3_htr.pearl.encoder import ContextEncoder, kl_to_prior
+from sb3_htr.pearl.exploration import to_explorer
+from sb3_htr.pearl.policies import LatentCritic, MlpPolicy, PEARLPolicy
+from sb3_htr.pearl.task_bank import TaskBank
+
+SelfPEARL = TypeVar("SelfPEARL", bound="PEARL")
 
 
 class PEARL(SAC):
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy}
+    """
+    Probabilistic Embeddings for Actor-critic RL (PEARL), with Hindsight Task Relabelling (HTR) in its replay buffer.
 
-    def __init__(self, policy, env, learning_rate=1e-3, buffer_size=1_000_000, learning_starts=4000, batch_size=16,
-                 tau=0.01, gamma=0.9, gradient_steps=200, ent_coef=0.01, meta_batch_size=64, context_size=20,
-                 kl_coef=0.005, tasks_per_rollout=20, n_prior_episodes=5, n_posterior_episodes=5,
-                 train_explorer="aggregate", test_explorer="plan",
-                 replay_buffer_kwargs=None, policy_kwargs=None, seed=None, verbose=0, device="auto", tensorboard_log=None,
-                 _init_setup_model=True):
+    PEARL paper: https://arxiv.org/abs/1903.08254, HTR paper: https://arxiv.org/abs/2112.00901.
+    Subclass of SB3's SAC, for its entropy coefficient and actor. As SAC after 2018, and unlike the paper, it has two target
+    critics instead of a value network.
+
+    One rollout collects whole episodes on ``n_tasks_per_rollout`` training tasks, as many at once as there are envs; then
+    follow ``gradient_steps`` updates. The defaults are the fast profile for two CPU cores on SparsePointRobot-v0, found by
+    measurement; the paper's values (A.2) are in ``hyperparams/pearl_paper.yml`` and given here where they differ.
+
+    :param policy: ``"MlpPolicy"`` or a subclass of PEARLPolicy
+    :param env: env of a task family (see ``htr_envs.TaskEnv``), VecEnv of such envs, or registered id
+    :param learning_rate: of all networks, may be a function of the remaining progress (paper: 3e-4)
+    :param buffer_size: capacity in transitions, shared equally by the training tasks
+    :param learning_starts: env steps with random actions before learning starts
+    :param batch_size: transitions per task for actor and critics (PEARL's reference: 256)
+    :param tau: soft update of the target critics, in (0, 1] (PEARL's reference: 0.005)
+    :param gamma: discount (PEARL's reference for the sparse point robot: 0.9)
+    :param gradient_steps: updates after each rollout (PEARL's reference: 1000)
+    :param replay_buffer_class: a MultiTaskReplayBuffer
+    :param replay_buffer_kwargs: its arguments, among them ``relabel_probability`` (K of HTR; 0 is plain PEARL)
+    :param ent_coef: entropy coefficient, ``"auto"`` learns it (0.01 is the reward scale 100 of PEARL's reference)
+    :param target_update_interval: updates between soft updates of the target critics
+    :param target_entropy: for ``ent_coef="auto"``
+    :param meta_batch_size: tasks per update (paper: 16)
+    :param context_size: transitions per task for the context; more than an episode has is padding under relabelling
+    :param kl_coef: weight of the KL divergence of the posterior from N(0, I), summed over z's dimensions and averaged over
+        tasks, beside the critics' squared errors averaged over transitions (PEARL's reference, in these units: 0.0016)
+    :param n_tasks_per_rollout: training tasks per rollout (PEARL's reference: 10)
+    :param n_episodes_per_task: episodes on each of them
+    :param n_exploration_episodes: episodes before the posterior is used, for the explorer ``"prior"``
+    :param explorer: how z is drawn before the posterior is used at meta-test, see :class:`Explorer`
+    :param train_explorer: the same for rollouts
+    :param stats_window_size: episodes over which logged returns are averaged
+    :param tensorboard_log: folder for TensorBoard, none by default
+    :param policy_kwargs: arguments of the policy: ``latent_dim``, ``net_arch``, ``encoder_arch`` (paper: 5, 3x300, 3x200)
+    :param verbose: 0 nothing, 1 info, 2 debug
+    :param seed: seed of all random generators
+    :param device: torch device
+    :param _init_setup_model: build networks at once
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy}
+    policy: PEARLPolicy
+    critic: LatentCritic  # type: ignore[assignment]
+    critic_target: LatentCritic  # type: ignore[assignment]
+    encoder: ContextEncoder
+    replay_buffer: MultiTaskReplayBuffer | None  # type: ignore[assignment]
+
+    def __init__(
+        self,
+        policy: str | type[PEARLPolicy],
+        env: GymEnv | str | None,
+        learning_rate: float | Schedule = 1e-3,
+        buffer_size: int = 1_000_000,
+        learning_starts: int = 4_000,
+        batch_size: int = 16,
+        tau: float = 0.01,
+        gamma: float = 0.9,
+        gradient_steps: int = 200,
+        replay_buffer_class: type[MultiTaskReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        ent_coef: str | float = 0.01,
+        target_update_interval: int = 1,
+        target_entropy: str | float = "auto",
+        meta_batch_size: int = 64,
+        context_size: int = 20,
+        kl_coef: float = 0.001,
+        n_tasks_per_rollout: int = 20,
+        n_episodes_per_task: int = 10,
+        n_exploration_episodes: int = 5,
+        explorer: str = "search",
+        train_explorer: str = "aggregate",
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        sizes = {
+            "meta_batch_size": meta_batch_size,
+            "batch_size": batch_size,
+            "context_size": context_size,
+            "n_tasks_per_rollout": n_tasks_per_rollout,
+            "n_episodes_per_task": n_episodes_per_task,
+        }
+        for name, size in sizes.items():
+            if size < 1:
+                raise ValueError(f"{name} is {size}, expected at least 1.")
+        if kl_coef < 0:
+            raise ValueError(f"kl_coef is {kl_coef}, expected 0 or more.")
         if isinstance(env, str):
-            env = make_task_vec_env(env, tasks_per_rollout, seed=seed)
-        super().__init__(policy, env, learning_rate, buffer_size, learning_starts, batch_size, tau, gamma,
-                         gradient_steps=gradient_steps, ent_coef=ent_coef, replay_buffer_class=MultiTaskReplayBuffer,
-                         replay_buffer_kwargs=replay_buffer_kwargs, policy_kwargs=policy_kwargs, seed=seed,
-                         verbose=verbose, device=device, tensorboard_log=tensorboard_log, _init_setup_model=False)
+            env = make_task_vec_env(env, n_tasks_per_rollout, seed=seed)
+        if env is not None:
+            env = self._wrap_env(env)
+            checks.check_spaces(env)
+        super().__init__(
+            policy=policy,  # type: ignore[arg-type]
+            env=env,  # type: ignore[arg-type]
+            learning_rate=learning_rate,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
+            tau=tau,
+            gamma=gamma,
+            gradient_steps=gradient_steps,
+            replay_buffer_class=replay_buffer_class or MultiTaskReplayBuffer,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            ent_coef=ent_coef,
+            target_update_interval=target_update_interval,
+            target_entropy=target_entropy,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs={} if policy_kwargs is None else dict(policy_kwargs),
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+        )
+        # SAC adds an argument for state-dependent exploration, which PEARL does not have: z explores
         self.policy_kwargs.pop("use_sde")
         self.meta_batch_size = meta_batch_size
         self.context_size = context_size
         self.kl_coef = kl_coef
-        self.tasks_per_rollout = tasks_per_rollout
-        self.n_prior_episodes = n_prior_episodes
-        self.n_posterior_episodes = n_posterior_episodes
-        self.train_explorer, self.test_explorer = train_explorer, test_explorer
+        self.n_tasks_per_rollout = n_tasks_per_rollout
+        self.n_episodes_per_task = n_episodes_per_task
+        self.n_exploration_episodes = n_exploration_episodes
+        self.explorer = to_explorer(explorer).value
+        self.train_explorer = to_explorer(train_explorer).value
+        self.task_bank: TaskBank | None = None
+        # Training tasks in the order of the coming rollouts: every task once, then every task once in another order
+        self._task_queue = np.zeros(0, dtype=np.int64)
+        self._warned_not_adapted = False
         if _init_setup_model:
             self._setup_model()
 
-    def _setup_model(self):
-        self.task_family = self.env.get_attr("task_family")[0]
-        self.max_episode_steps = self.env.get_attr("spec")[0].max_episode_steps
-        kw = dict(self.replay_buffer_kwargs)
-        self.replay_buffer_kwargs = {**kw, "task_family": self.task_family, "max_episode_steps": self.max_episode_steps}
-        super()._setup_model()
-        self.replay_buffer_kwargs = kw
-        self.replay_buffer.seed(self.seed)
-        self.rng = np.random.default_rng(self.seed)
-        self.bank = TaskBank(self.task_family)
-        self._task_queue = np.zeros(0, dtype=int)
+    def _setup_model(self) -> None:
+        if self.env is None:
+            # Loaded for prediction only: SB3 wants a buffer, we want no memory of it
+            self.replay_buffer = ReplayBuffer(1, self.observation_space, self.action_space)  # type: ignore[assignment]
+            super()._setup_model()
+            self.replay_buffer = None
+        else:
+            self._setup_replay(self.env)
+            super()._setup_model()
 
-    def _create_aliases(self):
+    def _setup_replay(self, env: VecEnv) -> None:
+        checks.check_reward_is_not_normalized(env)
+        family: TaskFamily = checks.get_task_family(env)
+        assert self.replay_buffer_class is not None
+        self.replay_buffer = self.replay_buffer_class(  # type: ignore[assignment]
+            self.buffer_size,
+            self.observation_space,
+            self.action_space,
+            device=self.device,
+            n_envs=self.n_envs,
+            seed=self.seed,
+            task_family=family,
+            max_episode_steps=checks.get_max_episode_steps(env),
+            **self.replay_buffer_kwargs,
+        )
+        self.task_bank = TaskBank(family)
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        :param env: env of the same spaces and number of copies; its task family replaces the old one if nothing was collected
+        :param force_reset: reset before training goes on
+        """
+        super().set_env(env, force_reset)
+        assert self.env is not None
+        if self.replay_buffer is None:
+            self._setup_replay(self.env)
+
+    def _create_aliases(self) -> None:
         super()._create_aliases()
         self.encoder = self.policy.encoder
 
-    def start_adaptation(self, n_envs, n_exploration_episodes=5, explorer=None, generator=None, context="best"):
-        return Adaptation(self.policy, n_envs, n_exploration_episodes, Explorer(explorer or self.test_explorer),
-                          self.max_episode_steps, generator, context)
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """
+        :param seed: seed of python, numpy, torch, envs, rollout tasks and replay buffer
+        """
+        super().set_random_seed(seed)
+        self._rng = np.random.default_rng(seed)
+        if isinstance(self.replay_buffer, MultiTaskReplayBuffer) and seed is not None:
+            self.replay_buffer.seed(seed)
 
-    def _next_tasks(self, n):
+    def learn(  # type: ignore[override]
+        self: SelfPEARL,
+        total_timesteps: int = 300_000,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 1,
+        tb_log_name: str = "PEARL",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfPEARL:
+        """
+        Meta-train.
+
+        :param total_timesteps: env steps; the last rollout is finished
+        :param callback: called at every step
+        :param log_interval: rollouts between two logs, None for no logs
+        :param tb_log_name: name of the run for TensorBoard
+        :param reset_num_timesteps: count env steps from 0
+        :param progress_bar: show one
+        :return: self
+        """
+        return super().learn(
+            total_timesteps=total_timesteps,
+            callback=callback,
+            log_interval=log_interval,  # type: ignore[arg-type]
+            tb_log_name=tb_log_name,
+            reset_num_timesteps=reset_num_timesteps,
+            progress_bar=progress_bar,
+        )
+
+    def _next_tasks(self, n: int) -> np.ndarray:
+        assert self.task_bank is not None
+        n_tasks = len(self.task_bank.task_family.train_tasks)
         while len(self._task_queue) < n:
-            self._task_queue = np.append(self._task_queue, self.rng.permutation(len(self.task_family.train_tasks)))
+            self._task_queue = np.append(self._task_queue, self._rng.permutation(n_tasks))
         tasks, self._task_queue = self._task_queue[:n], self._task_queue[n:]
         return tasks
 
-    def collect_rollouts(self, env, callback, train_freq, replay_buffer, action_noise=None, learning_starts=0, log_interval=None):
+    def collect_rollouts(  # type: ignore[override]
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        train_freq: TrainFreq,
+        replay_buffer: MultiTaskReplayBuffer,
+        action_noise: ActionNoise | None = None,
+        learning_starts: int = 0,
+        log_interval: int | None = None,
+    ) -> RolloutReturn:
+        """
+        Adapt to ``n_tasks_per_rollout`` training tasks, one per env at a time, and store all that happens.
+
+        Envs that finish their episodes before the others go on with more of them.
+
+        :param env: training env
+        :param callback: called at every step
+        :param train_freq: not used, a rollout is whole adaptations
+        :param replay_buffer: where the steps go
+        :param action_noise: not used
+        :param learning_starts: env steps with random actions
+        :param log_interval: rollouts between two logs
+        :return: what was collected
+        """
+        assert self.task_bank is not None
         self.policy.set_training_mode(False)
         callback.on_rollout_start()
-        steps = 0
-        n = env.num_envs
-        rows = []
-        for _ in range(-(-self.tasks_per_rollout // n)):
-            tasks = self._next_tasks(n)
-            env.set_options([{"task_id": int(t)} for t in tasks])
-            self._last_obs = env.reset()
+        n_steps, n_episodes = 0, 0
+        for _ in range(-(-self.n_tasks_per_rollout // env.num_envs)):
+            env.set_options([{"task_id": int(task)} for task in self._next_tasks(env.num_envs)])
+            self._last_obs = env.reset()  # type: ignore[assignment]
+            checks.check_task_ids(env)
+            if self._vec_normalize_env is not None:
+                self._last_original_obs = self._vec_normalize_env.get_original_obs()
             replay_buffer.discard_open_episodes()
-            adaptation = self.start_adaptation(n, self.n_prior_episodes, self.train_explorer)
-            left = np.full(n, self.n_prior_episodes + self.n_posterior_episodes)
-            while (left > 0).any():
-                if self.num_timesteps < learning_starts:
-                    buffer_actions = self.rng.uniform(-1, 1, (n, self.action_space.shape[0])).astype(np.float32)
-                    actions = self.policy.unscale_action(buffer_actions)
-                else:
-                    actions, _ = self.policy.predict(self._last_obs, (adaptation.z,), deterministic=False)
-                    buffer_actions = self.policy.scale_action(actions)
+            adaptation = self.start_adaptation(env.num_envs, explorer=self.train_explorer)
+            remaining = np.full(env.num_envs, self.n_episodes_per_task)
+            while (remaining > 0).any():
                 obs = self._last_obs
+                actions, buffer_actions = self._choose_actions(adaptation, learning_starts)
                 new_obs, rewards, dones, infos = env.step(actions)
-                self.num_timesteps += n
-                steps += n
+                self.num_timesteps += env.num_envs
+                n_steps += env.num_envs
+                # Give access to local variables
                 callback.update_locals(locals())
                 if not callback.on_step():
-                    return RolloutReturn(steps, 0, continue_training=False)
+                    return RolloutReturn(n_steps, n_episodes, continue_training=False)
                 self._update_info_buffer(infos, dones)
-                before = replay_buffer._open.copy() if dones.any() else None
-                self._store_transition(replay_buffer, buffer_actions, new_obs, rewards, dones, infos)
-                goal_reward = rewards - np.array([i["task_free_reward"] for i in infos])
-                adaptation.observe(obs, buffer_actions, rewards, dones, goal_reward)
-                if dones.any():
-                    rows.append(replay_buffer._open[dones].copy())
+                self._store_transition(replay_buffer, buffer_actions, new_obs, rewards, dones, infos)  # type: ignore[arg-type]
+                task_free = np.array([info.get("task_free_reward", 0.0) for info in infos])
+                adaptation.observe(obs, buffer_actions, rewards, task_free, dones)  # type: ignore[arg-type]
                 self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
-                left -= dones
-            self._episode_num += n * (self.n_prior_episodes + self.n_posterior_episodes)
-        self.bank.update(replay_buffer, np.concatenate(rows))
+                remaining -= dones
+                n_episodes += int(dones.sum())
+        self.task_bank.update(replay_buffer)
         callback.on_rollout_end()
-        if log_interval:
+        self._episode_num += n_episodes
+        self._n_rollouts = getattr(self, "_n_rollouts", 0) + 1
+        if log_interval is not None and self._n_rollouts % log_interval == 0:
             self.dump_logs()
-        return RolloutReturn(steps, 0, continue_training=True)
+        return RolloutReturn(n_steps, n_episodes, continue_training=True)
 
-    def train(self, gradient_steps, batch_size):
+    def _choose_actions(self, adaptation: Adaptation, learning_starts: int) -> tuple[np.ndarray, np.ndarray]:
+        """Actions for the envs, and the same scaled to [-1, 1]."""
+        if self.num_timesteps < learning_starts:
+            scaled = self._rng.uniform(-1, 1, (self.n_envs, *self.action_space.shape)).astype(np.float32)  # type: ignore[misc]
+            return self.policy.unscale_action(scaled), scaled
+        assert isinstance(self._last_obs, np.ndarray)
+        actions, _ = self.policy.predict(self._last_obs, (adaptation.z,))
+        return actions, self.policy.scale_action(actions)
+
+    def train(self, gradient_steps: int, batch_size: int) -> None:
+        """
+        Update encoder, critics and actor, then what is known about z before a reward.
+
+        :param gradient_steps: number of updates
+        :param batch_size: transitions per task for actor and critics
+        """
+        assert self.replay_buffer is not None and self.task_bank is not None
         self.policy.set_training_mode(True)
-        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer, self.encoder.optimizer])
-        M, B = self.meta_batch_size, batch_size
-        ent_coef = self.ent_coef_tensor
-        means, log = [], []
-        params, tparams = list(self.critic.parameters()), list(self.critic_target.parameters())
-        for step in range(gradient_steps):
-            data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env, meta_batch_size=M, context_size=self.context_size)
-            mean, var = self.encoder(data.context, data.context_mask)
-            z = mean + var.sqrt() * th.randn_like(mean)
-            kl = kl_to_prior(mean, var).mean()
-            means.append(mean.detach())
-            z_rows = z.unsqueeze(1).expand(-1, B, -1)
-            obs_z = th.cat([data.observations, z_rows], -1).flatten(0, 1)
-            actions = data.actions.flatten(0, 1)
+        optimizers = [self.actor.optimizer, self.critic.optimizer, self.encoder.optimizer]
+        if self.ent_coef_optimizer is not None:
+            optimizers.append(self.ent_coef_optimizer)
+        self._update_learning_rate(optimizers)
+        critic_parameters, target_parameters = list(self.critic.parameters()), list(self.critic_target.parameters())
+        means: list[th.Tensor] = []
+        logs: list[dict[str, th.Tensor]] = []
+        for _ in range(gradient_steps):
+            data = self.replay_buffer.sample(
+                batch_size,
+                env=self._vec_normalize_env,
+                meta_batch_size=self.meta_batch_size,
+                context_size=self.context_size,
+            )
+            # One backward pass through the encoder: it learns from the critics' errors and the KL term
+            mean, variance = self.encoder(data.context, data.context_mask)
+            z = mean + variance.sqrt() * th.randn_like(mean)
+            kl = kl_to_prior(mean, variance).mean()
+            z_rows = z.unsqueeze(1).expand(-1, batch_size, -1)
+            obs_z = th.cat([data.observations, z_rows], dim=-1).flatten(0, 1)
+            ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp()
             with th.no_grad():
-                next_obs_z = th.cat([data.next_observations, z_rows], -1).flatten(0, 1)
+                next_obs_z = th.cat([data.next_observations, z_rows], dim=-1).flatten(0, 1)
                 next_actions, next_log_prob = self.actor.action_log_prob(next_obs_z)
-                next_q = self.critic_target(next_obs_z, next_actions).amin(0) - ent_coef * next_log_prob
-                target = data.rewards.flatten() + (1 - data.dones.flatten()) * self.gamma * next_q
-            q = self.critic(obs_z, actions)
-            critic_loss = (q - target).square().mean() * len(q)
+                next_q = self.critic_target(next_obs_z, next_actions).amin(dim=0) - ent_coef * next_log_prob
+                target_q = data.rewards.flatten() + (1 - data.dones.flatten()) * self.gamma * next_q
+            q = self.critic(obs_z, data.actions.flatten(0, 1))
+            critic_loss = (q - target_q).square().sum(dim=0).mean()
             self.critic.optimizer.zero_grad()
             self.encoder.optimizer.zero_grad()
             (critic_loss + self.kl_coef * kl).backward()
             self.critic.optimizer.step()
             self.encoder.optimizer.step()
+
+            # The actor sees z, but does not shape it
             obs_z = obs_z.detach()
-            pi, log_prob = self.actor.action_log_prob(obs_z)
+            actions_pi, log_prob = self.actor.action_log_prob(obs_z)
             self.critic.requires_grad_(False)
-            actor_loss = (ent_coef * log_prob - self.critic(obs_z, pi).amin(0)).mean()
+            actor_loss = (ent_coef * log_prob - self.critic(obs_z, actions_pi).amin(dim=0)).mean()
             self.actor.optimizer.zero_grad()
             actor_loss.backward()
-            self.critic.requires_grad_(True)
             self.actor.optimizer.step()
-            with th.no_grad():
-                th._foreach_lerp_(tparams, params, self.tau)
-            if step == gradient_steps - 1:
-                log = [critic_loss.item(), actor_loss.item(), kl.item()]
-        self._n_updates += gradient_steps
-        self.policy.latent_prior.fit(th.cat(means[-20:]))
-        self._update_plan()
-        for k, v in zip(["critic_loss", "actor_loss", "kl"], log):
-            self.logger.record(f"train/{k}", v)
-        self.logger.record("train/solved", int(self.bank.solved.sum()))
+            self.critic.requires_grad_(True)
 
-    def _update_plan(self):
-        tasks, rows = self.bank.search_plan(self.replay_buffer)
-        if len(tasks):
-            ctx = th.as_tensor(rows[..., : self.policy.context_dim])
+            if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
+                ent_coef_loss = -(self.log_ent_coef * (log_prob.detach().mean() + self.target_entropy)).mean()
+                self.ent_coef_optimizer.zero_grad()
+                ent_coef_loss.backward()
+                self.ent_coef_optimizer.step()
+            self._n_updates += 1
+            if self._n_updates % self.target_update_interval == 0:
+                with th.no_grad():
+                    th._foreach_lerp_(target_parameters, critic_parameters, self.tau)
+            means.append(mean.detach())
+            relabelled = th.as_tensor(data.relabelled, device=self.device)
+            logs.append(
+                {
+                    "critic_loss": critic_loss.detach(),
+                    "actor_loss": actor_loss.detach(),
+                    "kl_divergence": kl.detach(),
+                    "ent_coef": ent_coef.detach().mean(),
+                    "posterior_std": variance.detach().sqrt().mean(),
+                    "q_value": q.detach().mean(),
+                    "relabelled_fraction": relabelled.float().mean(),
+                    "rl_reward_mean": data.rewards.mean(),
+                    "rl_zero_reward_fraction": (data.rewards == 0).all(dim=1).float().mean(),
+                }
+            )
+        for key in logs[0]:
+            self.logger.record(f"train/{key}", th.stack([log[key] for log in logs]).mean().item())
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self._update_latent_prior(th.cat(means[-20:]))
+
+    def _update_latent_prior(self, means: th.Tensor) -> None:
+        assert self.replay_buffer is not None and self.task_bank is not None
+        prior = self.policy.latent_prior
+        prior.set_aggregate(means)
+        solved = len(self.task_bank.solved)
+        self.logger.record("rollout/train_tasks_reached", solved)
+        if solved > 0:
+            context, mask = self.task_bank.search_plan(self.replay_buffer, prior.plan_size)
             with th.no_grad():
-                mean, _ = self.encoder(ctx, th.ones(ctx.shape[:2]))
-            self.policy.latent_prior.set_plan(mean)
+                plan, _ = self.encoder(th.as_tensor(context, device=self.device), th.as_tensor(mask, device=self.device))
+            prior.set_plan(plan)
+
+    def start_adaptation(
+        self,
+        n_envs: int,
+        n_exploration_episodes: int | None = None,
+        explorer: str | None = None,
+        generator: th.Generator | None = None,
+    ) -> Adaptation:
+        """
+        :param n_envs: number of tasks to adapt to side by side
+        :param n_exploration_episodes: for the explorer ``"prior"``, the model's own by default
+        :param explorer: the model's own by default
+        :param generator: source of randomness; torch's global one by default
+        :return: draws z and takes in what happens
+        """
+        if n_exploration_episodes is None:
+            n_exploration_episodes = self.n_exploration_episodes
+        return Adaptation(self.policy, n_envs, to_explorer(explorer or self.explorer), n_exploration_episodes, generator)
+
+    def adapt(
+        self,
+        env: gym.Env | VecEnv | str,
+        n_episodes: int = 5,
+        task: int | np.ndarray | None = None,
+        explorer: str | None = None,
+        deterministic: bool = True,
+        seed: int = 0,
+    ) -> AdaptedAgent:
+        """
+        Adapt to one task by trying it.
+
+        :param env: env with the task, or an id
+        :param n_episodes: episodes to adapt in; the posterior over them is what the agent acts with
+        :param task: index of a training task or task vector; by default the task that the env has (if it has none yet, one
+            is drawn). The env keeps it.
+        :param explorer: how z is drawn before the posterior is used, the model's own by default
+        :param deterministic: adapt with mean actions instead of samples
+        :param seed: seed of z
+        :return: an agent for this task, with the returns of its adaptation episodes
+        """
+        if n_episodes < 1:
+            raise ValueError(f"n_episodes is {n_episodes}, expected at least 1.")
+        vec_env = make_task_vec_env(env) if isinstance(env, str) else self._wrap_env(env, monitor_wrapper=False)
+        if vec_env.num_envs != 1:
+            raise ValueError(f"adapt() adapts to one task, but the VecEnv has {vec_env.num_envs} envs: pass a single env.")
+        if task is None:
+            vec_env.reset()
+            task = np.array(vec_env.get_attr("task")[0])
+        vec_env.set_options({"task_id": int(task)} if np.ndim(task) == 0 else {"task": np.asarray(task, dtype=np.float32)})
+        adaptation = self.start_adaptation(1, None, explorer, th.Generator().manual_seed(seed))
+        record = run_adaptation(self.policy, vec_env, adaptation, n_episodes, deterministic)
+        if adaptation.best_return[0] <= 0:
+            warnings.warn(f"No reward was found in {n_episodes} episodes, so the agent is not adapted: allow more.", stacklevel=2)
+        return AdaptedAgent(self.policy, adaptation.z[0].copy(), record.returns[0], record.successes[0])
+
+    def predict(  # type: ignore[override]
+        self,
+        observation: np.ndarray,
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        :param observation: (obs_dim,) or (n, obs_dim)
+        :param state: tuple of one array, z of each observation (n, latent_dim); without it the agent is not adapted to any
+            task, which is warned of once
+        :param episode_start: ignored: z lives longer than an episode
+        :param deterministic: mean action instead of a sample
+        :return: actions, and the state for the next call
+        """
+        if state is None and not self._warned_not_adapted:
+            self._warned_not_adapted = True
+            warnings.warn(
+                "This PEARL is not adapted to any task, so it acts with the prior mean of z. To see what it can do, use "
+                "sb3_htr.evaluate_adaptation(model, env), or evaluate_policy(model.adapt(env), env).",
+                stacklevel=2,
+            )
+        return self.policy.predict(observation, state, episode_start, deterministic)
+
+    def load_replay_buffer(
+        self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True
+    ) -> None:
+        """
+        :param path: file of ``save_replay_buffer``
+        :param truncate_last_traj: not used, only whole episodes are stored
+        """
+        super().load_replay_buffer(path, truncate_last_traj)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "encoder", "task_bank"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, variables = super()._get_torch_save_params()
+        return [*state_dicts, "encoder.optimizer"], variables

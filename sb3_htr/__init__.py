@@ -1,0 +1,10 @@
+"""Meta-reinforcement learning for Stable-Baselines3: PEARL with Hindsight Task Relabelling."""
+
+from pathlib import Path
+
+from sb3_htr.common.evaluation import evaluate_adaptation
+from sb3_htr.htr import MultiTaskReplayBuffer
+from sb3_htr.pearl import PEARL
+
+__version__ = (Path(__file__).parent / "version.txt").read_text().strip()
+__all__ = ["PEARL", "MultiTaskReplayBuffer", "__version__", "evaluate_adaptation"]

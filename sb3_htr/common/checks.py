@@ -1,0 +1,74 @@
+"""Says early and in one sentence why an env cannot be meta-trained on."""
+
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
+
+from sb3_htr.common.type_aliases import TaskFamily
+
+
+def check_spaces(env: VecEnv) -> None:
+    """
+    :param env: env to train on
+    :raises ValueError: if observations or actions are not vectors of bounded or unbounded floats
+    """
+    for name, space in (("observation", env.observation_space), ("action", env.action_space)):
+        if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+            raise ValueError(f"The {name} space is {space}, but PEARL needs a Box of one axis: flatten it with a wrapper.")
+
+
+def get_task_family(env: VecEnv) -> TaskFamily:
+    """
+    :param env: env to train on
+    :return: its task family
+    :raises ValueError: if it has none
+    """
+    advice = "derive the env from htr_envs.TaskEnv and test it with htr_envs.check_task_env"
+    if not env.has_attr("task_family"):
+        raise ValueError(f"The env has no task_family, so there are no tasks to meta-train on: {advice}.")
+    family: TaskFamily = env.get_attr("task_family")[0]
+    for name in ("compute_reward", "is_success", "hindsight_task", "train_tasks"):
+        if not hasattr(family, name):
+            raise ValueError(f"The env's task_family has no {name}, which hindsight relabelling needs: {advice}.")
+    return family
+
+
+def get_max_episode_steps(env: VecEnv) -> int:
+    """
+    :param env: env to train on
+    :return: its time limit
+    :raises ValueError: if it has none
+    """
+    spec = env.get_attr("spec")[0] if env.has_attr("spec") else None
+    if spec is None or spec.max_episode_steps is None:
+        raise ValueError(
+            "The env has no time limit, so its episodes may never end: make it with gymnasium.make(id), "
+            "registered with max_episode_steps."
+        )
+    return int(spec.max_episode_steps)
+
+
+def check_reward_is_not_normalized(env: VecEnv) -> VecNormalize | None:
+    """
+    :param env: env to train on
+    :return: its VecNormalize wrapper, if there is one
+    :raises ValueError: if that rescales rewards
+    """
+    normalize = unwrap_vec_normalize(env)
+    if normalize is not None and normalize.norm_reward:
+        raise ValueError(
+            "VecNormalize rescales rewards, which mixes the scales of all tasks and disagrees with relabelled rewards: "
+            "pass norm_reward=False."
+        )
+    return normalize
+
+
+def check_task_ids(env: VecEnv) -> None:
+    """
+    :param env: env to train on, after a reset
+    :raises ValueError: if it does not say which task it is on
+    """
+    if any("task_id" not in info for info in env.unwrapped.reset_infos):
+        raise ValueError(
+            "The env's reset returns no info['task_id'], so its experience cannot be kept apart by task: "
+            "add the index of the training task to the infos of reset and step."
+        )

@@ -1,0 +1,174 @@
+"""Meta-test: how well does an agent adapt to tasks that it has never seen?"""
+
+from typing import NamedTuple, Protocol
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_htr.common.checks import get_task_family
+from sb3_htr.common.vec_env import make_task_vec_env
+
+
+class AdaptsToTasks(Protocol):
+    """An adaptation in progress, see :class:`sb3_htr.pearl.adaptation.Adaptation`."""
+
+    z: np.ndarray
+
+    def observe(
+        self, obs: np.ndarray, actions: np.ndarray, rewards: np.ndarray, task_free_rewards: np.ndarray, dones: np.ndarray
+    ) -> None:
+        """Take in one step of each env."""
+        ...
+
+
+class MetaLearner(Protocol):
+    """What :func:`evaluate_adaptation` asks of a model; :class:`sb3_htr.PEARL` is one."""
+
+    policy: BasePolicy
+
+    def start_adaptation(
+        self,
+        n_envs: int,
+        n_exploration_episodes: int | None = None,
+        explorer: str | None = None,
+        generator: th.Generator | None = None,
+    ) -> AdaptsToTasks:
+        """Begin to adapt to one task per env."""
+        ...
+
+
+class AdaptationRecord(NamedTuple):
+    """
+    What happened in the adaptation episodes of some tasks.
+
+    :param returns: (n_tasks, n_episodes) float64, undiscounted returns as the env gave them
+    :param successes: (n_tasks, n_episodes) bool, whether some step of the episode solved the task
+    :param achieved: (n_tasks, n_episodes, T, task_dim) float32, the task that each step achieved, NaN after an episode's end
+    """
+
+    returns: np.ndarray
+    successes: np.ndarray
+    achieved: np.ndarray
+
+
+def run_adaptation(
+    policy: BasePolicy, env: VecEnv, adaptation: AdaptsToTasks, n_episodes: int, deterministic: bool = True
+) -> AdaptationRecord:
+    """
+    Run ``n_episodes`` episodes of each env, from a reset on.
+
+    :param policy: acts with ``adaptation.z``
+    :param env: its tasks, or the options to set them at the next reset, are given already
+    :param adaptation: learns from the episodes
+    :param n_episodes: episodes per env
+    :param deterministic: mean actions instead of samples
+    :return: one row per env
+    """
+    n_envs = env.num_envs
+    obs = env.reset()
+    assert isinstance(obs, np.ndarray)
+    episode, envs = np.zeros(n_envs, dtype=np.int64), np.arange(n_envs)
+    returns = np.zeros((n_envs, n_episodes + 1))
+    successes = np.zeros((n_envs, n_episodes + 1), dtype=bool)
+    steps: list[np.ndarray] = []
+    episode_of_step: list[np.ndarray] = []
+    while (episode < n_episodes).any():
+        actions, _ = policy.predict(obs, (adaptation.z,), deterministic=deterministic)
+        new_obs, rewards, dones, infos = env.step(actions)
+        # Envs that are ahead of the others write to a column that is cut off
+        column = np.minimum(episode, n_episodes)
+        returns[envs, column] += rewards
+        successes[envs, column] |= [info["is_success"] for info in infos]
+        steps.append(np.array([info["achieved_task"] for info in infos], dtype=np.float32))
+        episode_of_step.append(column)
+        task_free = np.array([info["task_free_reward"] for info in infos])
+        adaptation.observe(obs, policy.scale_action(actions), rewards, task_free, dones)
+        obs = new_obs  # type: ignore[assignment]
+        episode += dones
+    achieved = _by_episode(np.stack(steps, axis=1), np.stack(episode_of_step, axis=1), n_episodes)
+    return AdaptationRecord(returns[:, :n_episodes], successes[:, :n_episodes], achieved)
+
+
+def _by_episode(steps: np.ndarray, episode: np.ndarray, n_episodes: int) -> np.ndarray:
+    """(n, total_steps, dim) and the episode of each step (n, total_steps) -> (n, n_episodes, T, dim), padded with NaN."""
+    start = np.stack([np.argmax(episode == i, axis=1) for i in range(n_episodes + 1)], axis=1)
+    position = np.arange(episode.shape[1]) - np.take_along_axis(start, episode, axis=1)
+    kept = episode < n_episodes
+    result = np.full((len(steps), n_episodes, position[kept].max() + 1, steps.shape[2]), np.nan, dtype=np.float32)
+    env = np.broadcast_to(np.arange(len(steps))[:, None], episode.shape)
+    result[env[kept], episode[kept], position[kept]] = steps[kept]
+    return result
+
+
+def record_adaptation(
+    model: MetaLearner,
+    env: VecEnv | gym.Env | str,
+    tasks: np.ndarray | None = None,
+    n_episodes: int = 20,
+    n_exploration_episodes: int | None = None,
+    explorer: str | None = None,
+    deterministic: bool = True,
+    seed: int = 0,
+) -> AdaptationRecord:
+    """
+    As :func:`evaluate_adaptation`, with what each step achieved.
+    """
+    if n_episodes < 1:
+        raise ValueError(f"n_episodes is {n_episodes}, expected at least 1.")
+    n_tasks = 20 if tasks is None else len(tasks)
+    if isinstance(env, str):
+        env = make_task_vec_env(env, max(n_tasks, 1))
+    elif isinstance(env, gym.Env):
+        env = BaseAlgorithm._wrap_env(env, monitor_wrapper=False)
+    tasks = get_task_family(env).test_tasks if tasks is None else np.asarray(tasks, dtype=np.float32)
+    if tasks.ndim != 2 or len(tasks) == 0:
+        raise ValueError(f"tasks have shape {tasks.shape}, expected (n_tasks, task_dim) with at least one task.")
+    generator = th.Generator().manual_seed(seed)
+    env.seed(seed)
+    records = []
+    for first in range(0, len(tasks), env.num_envs):
+        # Envs without a task of their own repeat the last one
+        index = np.minimum(np.arange(first, first + env.num_envs), len(tasks) - 1)
+        env.set_options([{"task": task} for task in tasks[index]])
+        adaptation = model.start_adaptation(env.num_envs, n_exploration_episodes, explorer, generator)
+        record = run_adaptation(model.policy, env, adaptation, n_episodes, deterministic)
+        records.append([values[: len(tasks) - first] for values in record])
+    length = max(achieved.shape[2] for _, _, achieved in records)
+    for record_ in records:
+        padding = ((0, 0), (0, 0), (0, length - record_[2].shape[2]), (0, 0))
+        record_[2] = np.pad(record_[2], padding, constant_values=np.nan)
+    return AdaptationRecord(*(np.concatenate(values) for values in zip(*records, strict=True)))
+
+
+def evaluate_adaptation(
+    model: MetaLearner,
+    env: VecEnv | gym.Env | str,
+    tasks: np.ndarray | None = None,
+    n_episodes: int = 20,
+    n_exploration_episodes: int | None = None,
+    explorer: str | None = None,
+    deterministic: bool = True,
+    seed: int = 0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Adapt to each task from scratch and report every episode (the protocol of PEARL's reference implementation).
+
+    The context of a task's posterior comes from the episodes of this very adaptation and from nowhere else.
+
+    :param model: a PEARL
+    :param env: env, VecEnv (its envs adapt side by side, each to a task of its own) or registered id
+    :param tasks: (n_tasks, task_dim), by default the test tasks of the env
+    :param n_episodes: adaptation episodes per task; 20 in PEARL's reference
+    :param n_exploration_episodes: see :class:`sb3_htr.pearl.adaptation.Adaptation`; the model's own by default
+    :param explorer: how z is drawn before the posterior is used, the model's own by default; ``"prior"`` is PEARL's protocol
+    :param deterministic: mean actions instead of samples
+    :param seed: seed of env and z; the random state of training is left alone
+    :return: returns and successes, (n_tasks, n_episodes) each
+    :raises ValueError: if there are no tasks or episodes, or the env has no task family
+    """
+    record = record_adaptation(model, env, tasks, n_episodes, n_exploration_episodes, explorer, deterministic, seed)
+    return record.returns, record.successes
