@@ -80,7 +80,6 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         rl_batch_source: str = "episode",
         rl_reward_type: str = "sparse",
         context_episodes: int = 10,
-        hindsight_context_episodes: int = 1,
         seed: int | None = None,
     ) -> None:
         if not 0 <= relabel_probability <= 1:
@@ -111,7 +110,6 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         self.rl_batch_source = rl_batch_source
         self.rl_reward_type = rl_reward_type
         self.context_episodes = context_episodes
-        self.hindsight_context_episodes = hindsight_context_episodes
         self.obs_dim = int(np.prod(observation_space.shape or ()))
         # Columns of a transition. (o, a, r) come first: they are what the context encoder sees.
         o, a = self.obs_dim, self.action_dim
@@ -273,10 +271,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             n_episodes = index.task_episode[task + 1] - index.task_episode[task]
             episode = index.task_episode[task] + (rng.random(len(task)) * n_episodes).astype(np.int64)
             start, end = index.episode_row[episode], index.episode_row[episode + 1]
-            first, last = self._draw_window(episode, index.task_episode[task], index.task_episode[task + 1])
-            context[relabelled], context_length[relabelled] = self._draw_context(
-                rng, index.episode_row[first], index.episode_row[last], context_size
-            )
+            context[relabelled], context_length[relabelled] = self._draw_context(rng, start, end, context_size)
             if self.rl_batch_source == "episode":
                 rl[relabelled] = spread(rng, start, end - start, np.full(len(task), batch_size), batch_size)
             step = start + select_step(self.hindsight_task_strategy, end - start, rng)
@@ -303,13 +298,6 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             task_ids=tasks,
             relabelled=relabelled,
         )
-
-    def _draw_window(self, episode: np.ndarray, first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Some consecutive episodes of a task (half-open range ``first:last``), ``episode`` among them."""
-        length = self._relabel_rng.integers(1, self.hindsight_context_episodes + 1, size=len(episode))
-        before = (self._relabel_rng.random(len(episode)) * length).astype(np.int64)
-        start = np.maximum(episode - before, first)
-        return start, np.minimum(start + length, last)
 
     @staticmethod
     def _draw_context(

@@ -6,6 +6,10 @@ import torch as th
 from sb3_htr.pearl.exploration import Explorer
 from sb3_htr.pearl.policies import PEARLPolicy
 
+# Posterior samples that may be worse than the best episode before its z is acted with again. The posterior of an episode that
+# only grazed its goal can point past it, and would do so for ever.
+MAX_SETBACKS = 2
+
 
 class Adaptation:
     """
@@ -42,6 +46,9 @@ class Adaptation:
         self._episode_return = np.zeros(n_envs, dtype=np.float64)
         # Rows of the best episode, first and last + 1
         self._best = np.zeros((n_envs, 2), dtype=np.int64)
+        self._best_z = np.zeros_like(self.z)
+        # Episodes since the best one
+        self._setbacks = np.zeros(n_envs, dtype=np.int64)
         self._draw(np.arange(n_envs))
 
     def observe(
@@ -67,6 +74,9 @@ class Adaptation:
         better = ended[self._episode_return[ended] > self.best_return[ended]]
         self.best_return[better] = self._episode_return[better]
         self._best[better] = np.stack([self._episode_start, self._n_rows], axis=1)[better]
+        self._best_z[better] = self.z[better]
+        self._setbacks[ended] += 1
+        self._setbacks[better] = 0
         self._episode_return[ended] = 0
         self._episode_start[ended] = self._n_rows[ended]
         self.n_episodes[ended] += 1
@@ -84,7 +94,11 @@ class Adaptation:
         """New z for some envs."""
         attempt = th.as_tensor(self.n_episodes[envs])
         explored = self.policy.latent_prior.sample(self.explorer, attempt, self.generator).cpu().numpy()
-        self.z[envs] = np.where(self.exploring()[envs, None], explored, self._sample_posterior(envs))
+        exploited = self._sample_posterior(envs)
+        if self.explorer is not Explorer.PRIOR:
+            stuck = self._setbacks[envs] >= MAX_SETBACKS
+            exploited[stuck] = self._best_z[envs[stuck]]
+        self.z[envs] = np.where(self.exploring()[envs, None], explored, exploited)
 
     def _sample_posterior(self, envs: np.ndarray) -> np.ndarray:
         row = np.arange(self._n_rows[envs].max())

@@ -1,0 +1,150 @@
+"""Evaluation during meta-training."""
+
+import os
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+import numpy as np
+from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.vec_env import sync_envs_normalization
+
+from sb3_htr.common.checkpoint import atomic_path
+from sb3_htr.common.checks import get_task_family
+from sb3_htr.common.evaluation import MetaLearner, record_adaptation
+
+
+class MetaEvalCallback(EvalCallback):
+    """
+    Evaluates how well the agent adapts, as SB3's ``EvalCallback`` evaluates how well an agent acts.
+
+    The score is the mean return of the last adaptation episode over the tasks. ``best_model.zip`` is chosen by it, on
+    validation tasks by default, so that the test tasks stay unseen until the end. ``evaluations.npz`` has ``timesteps``
+    (n,), ``results`` (n, n_tasks), the returns of the last episode, and ``returns`` and ``successes``
+    (n, n_tasks, n_adaptation_episodes).
+
+    :param eval_env: env of the task family
+    :param tasks: ``"validation"``, ``"test"`` or task vectors (n_tasks, task_dim)
+    :param n_adaptation_episodes: episodes per task (PEARL's reference: 20)
+    :param explorer: how z is drawn before the posterior is used, the model's own by default
+    :param kwargs: arguments of SB3's ``EvalCallback``; ``n_eval_episodes`` has no effect, each task is adapted to once
+    """
+
+    def __init__(
+        self,
+        eval_env: Any,
+        *args: Any,
+        tasks: str | np.ndarray = "validation",
+        n_adaptation_episodes: int = 20,
+        explorer: str | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(eval_env, *args, **kwargs)
+        if isinstance(tasks, str):
+            if tasks not in ("validation", "test"):
+                raise ValueError(f'tasks is {tasks!r}, expected "validation", "test" or an array of task vectors.')
+            tasks = getattr(get_task_family(self.eval_env), f"{tasks}_tasks")
+        self.tasks: np.ndarray = np.asarray(tasks)
+        self.n_adaptation_episodes = n_adaptation_episodes
+        self.explorer = explorer
+        self.returns: list[np.ndarray] = []
+        self.successes: list[np.ndarray] = []
+
+    def _init_callback(self) -> None:
+        # SB3's warns where training and evaluation envs are of different types, which they may be here
+        for folder in (self.best_model_save_path, self.log_path and os.path.dirname(self.log_path)):
+            if folder:
+                os.makedirs(folder, exist_ok=True)
+        if self.callback_on_new_best is not None:
+            self.callback_on_new_best.init_callback(self.model)
+
+    def _on_step(self) -> bool:
+        if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
+            return True
+        if self.model.get_vec_normalize_env() is not None:
+            sync_envs_normalization(self.training_env, self.eval_env)
+        record = record_adaptation(
+            cast(MetaLearner, self.model),
+            self.eval_env,
+            self.tasks,
+            self.n_adaptation_episodes,
+            explorer=self.explorer,
+            deterministic=self.deterministic,
+        )
+        self.evaluations_timesteps.append(self.num_timesteps)
+        self.returns.append(record.returns)
+        self.successes.append(record.successes)
+        if self.log_path is not None:
+            with atomic_path(f"{self.log_path}.npz") as path:
+                np.savez_compressed(
+                    path,
+                    timesteps=self.evaluations_timesteps,
+                    results=np.stack(self.returns)[:, :, -1],
+                    returns=np.stack(self.returns),
+                    successes=np.stack(self.successes),
+                )
+        self.last_mean_reward = float(record.returns[:, -1].mean())
+        self._log(record.returns, record.successes)
+        continue_training = True
+        if self.last_mean_reward > self.best_mean_reward:
+            self.best_mean_reward = self.last_mean_reward
+            if self.best_model_save_path is not None:
+                with atomic_path(Path(self.best_model_save_path) / "best_model.zip") as path:
+                    self.model.save(path)
+            if self.callback_on_new_best is not None:
+                continue_training = self.callback_on_new_best.on_step()
+        if self.callback is not None:
+            continue_training = continue_training and self._on_event()
+        return continue_training
+
+    def _log(self, returns: np.ndarray, successes: np.ndarray) -> None:
+        found = successes.any(axis=1)
+        # A task that was never solved counts as if it were solved just after the end
+        first = np.where(found, successes.argmax(axis=1) + 1, successes.shape[1] + 1)
+        self.logger.record("eval/mean_reward", self.last_mean_reward)
+        self.logger.record("eval/first_episode_return", float(returns[:, 0].mean()))
+        self.logger.record("eval/success_rate", float(successes[:, -1].mean()))
+        self.logger.record("eval/episodes_to_first_success", float(first.mean()))
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(self.num_timesteps)
+        if self.verbose >= 1:
+            print(
+                f"Eval num_timesteps={self.num_timesteps}: return of adaptation episode 1: {returns[:, 0].mean():.2f}, "
+                f"of episode {returns.shape[1]}: {self.last_mean_reward:.2f}, success {successes[:, -1].mean():.0%}"
+            )
+
+
+class TrialResult(Protocol):
+    """The part of an Optuna trial that :class:`MetaTrialEvalCallback` uses."""
+
+    def report(self, value: float, step: int) -> None:
+        """Report an intermediate value."""
+        ...
+
+    def should_prune(self) -> bool:
+        """Whether the trial is hopeless."""
+        ...
+
+
+class MetaTrialEvalCallback(MetaEvalCallback):
+    """
+    :class:`MetaEvalCallback` for a trial of a hyperparameter search; has the attributes of rl_zoo3's ``TrialEvalCallback``.
+
+    :param eval_env: env of the task family
+    :param trial: told of every evaluation, and asked whether to go on
+    :param kwargs: as for :class:`MetaEvalCallback`
+    """
+
+    def __init__(self, eval_env: Any, trial: TrialResult, **kwargs: Any) -> None:
+        super().__init__(eval_env, **{"verbose": 0, **kwargs})
+        self.trial = trial
+        self.eval_idx = 0
+        self.is_pruned = False
+
+    def _on_step(self) -> bool:
+        n_evaluations = len(self.returns)
+        continue_training = super()._on_step()
+        if len(self.returns) > n_evaluations:
+            self.eval_idx += 1
+            self.trial.report(self.last_mean_reward, self.eval_idx)
+            self.is_pruned = self.trial.should_prune()
+        return continue_training and not self.is_pruned
