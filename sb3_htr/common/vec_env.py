@@ -1,5 +1,6 @@
 """Batched task envs for Stable-Baselines3."""
 
+import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -88,7 +89,7 @@ def make_task_vec_env(
     env_id: str,
     n_envs: int = 1,
     seed: int | None = None,
-    monitor_file: str | None = None,
+    monitor_dir: str | None = None,
     env_kwargs: dict[str, Any] | None = None,
 ) -> VecEnv:
     """
@@ -97,14 +98,15 @@ def make_task_vec_env(
     :param env_id: a registered id; ``"module:id"`` imports the module first
     :param n_envs: number of envs stepped together
     :param seed: seed of the envs' own randomness
-    :param monitor_file: where to write episode returns (CSV), nowhere by default
+    :param monitor_dir: folder for the CSV of episode returns, none by default
     :param env_kwargs: arguments of the env
     :return: a monitored VecEnv
     """
     spec = gym.spec(env_id)
     if spec.vector_entry_point is None:
-        return make_vec_env(env_id, n_envs, seed=seed, monitor_dir=monitor_file, env_kwargs=env_kwargs)
+        return make_vec_env(env_id, n_envs, seed=seed, monitor_dir=monitor_dir, env_kwargs=env_kwargs)
     vector_env = gym.make_vec(env_id, n_envs, vectorization_mode="vector_entry_point", **(env_kwargs or {}))
+    monitor_file = None if monitor_dir is None else os.path.join(monitor_dir, "0.monitor.csv")
     venv = VecMonitor(BatchedTaskVecEnv(vector_env), monitor_file, info_keywords=("is_success",))
     venv.seed(seed)
     return venv

@@ -223,7 +223,7 @@ class PEARL(SAC):
 
     def learn(  # type: ignore[override]
         self: SelfPEARL,
-        total_timesteps: int = 300_000,
+        total_timesteps: int = 150_000,
         callback: MaybeCallback = None,
         log_interval: int | None = 1,
         tb_log_name: str = "PEARL",

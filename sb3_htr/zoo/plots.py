@@ -1,0 +1,100 @@
+"""Pictures of an adaptation."""
+
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.patches import Circle
+
+from sb3_htr.common.checkpoint import atomic_path
+from sb3_htr.common.evaluation import AdaptationRecord
+
+# Okabe and Ito's colours, told apart by all kinds of colour vision
+BLUE, ORANGE, GREEN, GREY = "#0072B2", "#E69F00", "#009E73", "#999999"
+
+
+def _save(figure: plt.Figure, path: Path) -> None:
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=120, bbox_inches="tight")
+    plt.close(figure)
+
+
+def plot_adaptation_curve(record: AdaptationRecord, path: Path, title: str) -> None:
+    """
+    Return and success of each adaptation episode, with the spread over tasks.
+
+    :param record: adaptations
+    :param path: picture to write
+    :param title: what was adapted
+    """
+    returns, successes = record.returns, record.successes
+    episodes = np.arange(1, returns.shape[1] + 1)
+    figure, (top, bottom) = plt.subplots(2, 1, sharex=True, figsize=(6.4, 5.2), height_ratios=[2, 1])
+    low, high = np.quantile(returns, [0.25, 0.75], axis=0)
+    top.fill_between(episodes, low, high, color=BLUE, alpha=0.2, linewidth=0, label="middle half of the tasks")
+    top.plot(episodes, returns.mean(axis=0), color=BLUE, marker="o", markersize=4, label="mean over tasks")
+    top.set_ylabel("return")
+    top.set_title(title)
+    top.legend(frameon=False, loc="lower right")
+    bottom.plot(episodes, 100 * successes.mean(axis=0), color=ORANGE, marker="o", markersize=4, label="in this episode")
+    found = 100 * np.maximum.accumulate(successes, axis=1).mean(axis=0)
+    bottom.plot(episodes, found, color=GREY, linestyle="--", label="so far")
+    bottom.set_ylabel("tasks solved (%)")
+    bottom.set_ylim(-4, 104)
+    bottom.set_xlabel("adaptation episode")
+    bottom.set_xticks(episodes)
+    bottom.legend(frameon=False, loc="lower right")
+    for axes in (top, bottom):
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(alpha=0.25)
+    _save(figure, path)
+
+
+def plot_adaptation_paths(
+    record: AdaptationRecord, tasks: np.ndarray, goal_radius: float | None, path: Path, n_tasks: int = 6
+) -> None:
+    """
+    The ways of the adaptation episodes on the plane, for task spaces that are a plane.
+
+    :param record: adaptations
+    :param tasks: (n, 2) goals
+    :param goal_radius: radius of the goals, drawn as a point if None
+    :param path: picture to write
+    :param n_tasks: number of tasks to show, evenly taken from all of them
+    """
+    shown = np.unique(np.linspace(0, len(tasks) - 1, n_tasks).astype(int))
+    order = np.argsort(np.arctan2(tasks[:, 1], tasks[:, 0]))[shown]
+    columns = min(3, len(order))
+    rows = -(-len(order) // columns)
+    figure, grid = plt.subplots(rows, columns, figsize=(3.1 * columns, 2.9 * rows), squeeze=False, sharex=True, sharey=True)
+    for axes in grid.flat[len(order) :]:
+        axes.set_visible(False)
+    for axes, task in zip(grid.flat, order, strict=False):
+        successes = record.successes[task]
+        first = int(successes.argmax()) if successes.any() else len(successes)
+        axes.add_patch(Circle(tasks[task], goal_radius or 0.03, facecolor=GREEN, alpha=0.35, edgecolor=GREEN))
+        for episode, way in enumerate(record.achieved[task]):
+            # A step's achieved task is where it led; the start is not part of it
+            line = {"color": GREY, "alpha": 0.8, "linewidth": 1.0} if episode < first else {"color": BLUE, "linewidth": 1.2}
+            axes.plot(way[:, 0], way[:, 1], **line)
+        last = record.achieved[task, -1]
+        axes.plot(last[:, 0], last[:, 1], color=ORANGE, linewidth=2)
+        text = f"solved in episode {first + 1}" if successes.any() else "not solved"
+        axes.set_title(f"{text}, last return {record.returns[task, -1]:.1f}", fontsize=9)
+        axes.set_aspect("equal")
+        axes.spines[["top", "right"]].set_visible(False)
+    handles = [
+        plt.Line2D([], [], color=GREY, label="before the first success"),
+        plt.Line2D([], [], color=BLUE, label="after it"),
+        plt.Line2D([], [], color=ORANGE, linewidth=2, label="last episode"),
+        plt.Line2D([], [], color=GREEN, marker="o", linestyle="", alpha=0.5, markersize=9, label="hidden goal"),
+    ]
+    figure.legend(handles=handles, loc="lower center", ncols=4, frameon=False)
+    figure.supxlabel("x", y=0.07)
+    figure.supylabel("y")
+    figure.tight_layout(rect=(0, 0.06, 1, 1))
+    _save(figure, path)
