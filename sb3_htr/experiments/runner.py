@@ -1,0 +1,109 @@
+"""Runs the cells of an experiment, several at a time, and picks up where a killed one stopped."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import htr_envs  # noqa: F401 registers the envs
+from sb3_htr import PEARL
+from sb3_htr.common.checkpoint import atomic_path
+from sb3_htr.common.evaluation import evaluate_adaptation
+from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.zoo.evaluate import find_run
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """
+    One training run.
+
+    :param env_id: registered env
+    :param method: name in ``summary.json``
+    :param seed: seed of the run
+    :param n_timesteps: budget of env steps
+    :param hyperparams: what differs from the YAML file
+    :param env_kwargs: arguments of the env
+    :param explorers: how the final model explores on the test tasks; one row of results for each
+    """
+
+    env_id: str
+    method: str
+    seed: int
+    n_timesteps: int
+    hyperparams: dict[str, Any] = field(default_factory=dict)
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    explorers: tuple[str, ...] = ("search", "prior")
+
+    @property
+    def name(self) -> str:
+        """Folder of the run."""
+        return f"{self.method}-seed{self.seed}"
+
+    def command(self, folder: Path, eval_freq: int) -> list[str]:
+        """
+        :param folder: log folder
+        :param eval_freq: env steps between evaluations on the validation tasks
+        :return: command line of the training
+        """
+        settings = [f"{key}:{value!r}" for key, value in self.hyperparams.items()]
+        kwargs = [f"{key}:{value!r}" for key, value in self.env_kwargs.items()]
+        return [
+            *(sys.executable, "-m", "sb3_htr.zoo.cli", "train", "--env", self.env_id, "-f", str(folder), "--verbose", "0"),
+            *("-n", str(self.n_timesteps), "--seed", str(self.seed), "--eval-freq", str(eval_freq)),
+            *(["-params", *settings] if settings else []),
+            *(["--env-kwargs", *kwargs] if kwargs else []),
+        ]
+
+
+def run_cell(cell: Cell, folder: Path, eval_freq: int) -> Path:
+    """
+    Train, then adapt the final model to the test tasks.
+
+    :param cell: what to run
+    :param folder: where all cells' folders are; a cell that has a result there is not run again
+    :param eval_freq: env steps between evaluations
+    :return: npz with ``timesteps``, ``curve`` (n, n_tasks) on validation tasks, and for each explorer
+        ``returns_<explorer>`` and ``successes_<explorer>`` (n_tasks, n_episodes) on test tasks
+    """
+    result = folder / f"{cell.name}.npz"
+    if result.exists():
+        return result
+    start = time.monotonic()
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    (folder / cell.name).mkdir(parents=True, exist_ok=True)
+    with open(folder / cell.name / "log.txt", "a") as log:
+        subprocess.run(cell.command(folder / cell.name, eval_freq), check=True, stdout=log, stderr=log, env=environment)
+    wall = time.monotonic() - start
+    run = find_run(folder / cell.name)
+    model = PEARL.load(run / f"{cell.env_id}.zip", device="cpu")
+    evaluations = np.load(run / "evaluations.npz")
+    arrays: dict[str, Any] = {"timesteps": evaluations["timesteps"], "curve": evaluations["results"], "wall_s": wall}
+    env = make_task_vec_env(cell.env_id, 20, env_kwargs=cell.env_kwargs)
+    for explorer in cell.explorers:
+        returns, successes = evaluate_adaptation(model, env, explorer=explorer)
+        arrays |= {f"returns_{explorer}": returns.astype(np.float32), f"successes_{explorer}": successes}
+    with atomic_path(result) as path:
+        np.savez_compressed(path, **arrays)
+    print(f"{cell.name}: {json.dumps({e: round(float(arrays[f'returns_{e}'][:, -1].mean()), 2) for e in cell.explorers})}")
+    return result
+
+
+def run_cells(cells: list[Cell], folder: Path, jobs: int, eval_freq: int = 10_000) -> dict[Cell, Path]:
+    """
+    :param cells: runs of the experiment
+    :param folder: where runs and results go
+    :param jobs: number of runs at a time, each on one thread
+    :param eval_freq: env steps between evaluations
+    :return: the result file of each cell
+    """
+    with ThreadPoolExecutor(jobs) as pool:
+        paths = list(pool.map(lambda cell: run_cell(cell, folder, eval_freq), cells))
+    return dict(zip(cells, paths, strict=True))
