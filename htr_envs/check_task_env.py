@@ -54,10 +54,10 @@ def _select(traj: Trajectory, index: Any) -> Trajectory:
 
 
 def _check_interface(env: gym.Env[Any, Any]) -> TaskFamily:
-    base = env.unwrapped
+    base: Any = env.unwrapped
     for name in ("task_family", "set_task", "compute_reward", "hindsight_task", *TASK_SETS, "task_space"):
         _require(hasattr(base, name), f"The env has no `{name}`: derive it from htr_envs.TaskEnv.")
-    family: TaskFamily = base.task_family  # type: ignore[attr-defined]
+    family: TaskFamily = base.task_family
     for name in (*HOOKS, *TASK_SETS, "task_space"):
         _require(hasattr(family, name), f"The task family has no `{name}`: derive it from htr_envs.TaskFamily.")
     for what, space in (("observation_space", env.observation_space), ("action_space", env.action_space)):
@@ -139,7 +139,8 @@ def _play(
 
 
 def _check_rewards(env: gym.Env[Any, Any], family: TaskFamily, episode: Episode, task: FloatArray) -> None:
-    rewards = _call("compute_reward fails on an episode.", env.unwrapped.compute_reward, episode.traj, task)  # type: ignore[attr-defined]
+    base: Any = env.unwrapped
+    rewards = base.compute_reward(episode.traj, task)
     shaped = isinstance(rewards, np.ndarray) and rewards.dtype == np.float32 and rewards.shape == episode.rewards.shape
     _require(shaped, "compute_reward must return one float32 for each step, an array (..., T).")
     _require(np.isfinite(rewards).all(), "compute_reward returned a number that is not finite.")
@@ -150,7 +151,7 @@ def _check_rewards(env: gym.Env[Any, Any], family: TaskFamily, episode: Episode,
 
 
 def _check_reward_types(family: TaskFamily, traj: Trajectory, task: FloatArray) -> None:
-    dense = _call("compute_reward has no reward type 'dense'.", family.compute_reward, traj, task, "dense")
+    dense = family.compute_reward(traj, task, "dense")
     finite = isinstance(dense, np.ndarray) and dense.dtype == np.float32 and bool(np.isfinite(dense).all())
     _require(finite, "compute_reward with reward_type='dense' must return finite float32 numbers.")
     try:
@@ -186,23 +187,25 @@ def _check_vectorized(name: str, hook: Callable[[Trajectory, Any], Any], traj: T
         _require(_same(_call(vectorized, hook, steps, task), expected), vectorized)
 
 
-def _check_pure(family: TaskFamily, traj: Trajectory, tasks: FloatArray) -> None:
-    def results() -> list[NDArray[Any]]:
-        rewards = [family.compute_reward(traj, tasks[0]), family.compute_reward(traj, tasks[1], "dense")]
-        return [*rewards, family.is_success(traj, tasks[0]), family.hindsight_task(traj, 0)]
-
-    arguments = [*traj, tasks]
-    before = [values.copy() for values in arguments]
-    first, second = results(), results()
-    unchanged = all(np.array_equal(values, kept) for values, kept in zip(arguments, before, strict=True))
-    _require(unchanged, "A hook of the task family changes its arguments: it must be pure.")
-    repeated = all(map(_same, first, second))
-    _require(repeated, "A hook of the task family gives something else when it is called again: it must be pure.")
+def _check_pure(family: TaskFamily, traj: Trajectory) -> None:
+    task, other_task = family.train_tasks[0], family.train_tasks[-1]
+    calls: dict[str, Callable[[], Any]] = {
+        "compute_reward": lambda: family.compute_reward(traj, task),
+        "compute_reward with reward_type='dense'": lambda: family.compute_reward(traj, other_task, "dense"),
+        "is_success": lambda: family.is_success(traj, task),
+        "hindsight_task": lambda: family.hindsight_task(traj, 0),
+    }
+    before = [values.copy() for values in traj]
+    first, second = ([_call(f"{name} fails on an episode.", call) for name, call in calls.items()] for _ in range(2))
+    for name, result, again in zip(calls, first, second, strict=True):
+        _require(_same(result, again), f"{name} gives something else when it is called again: it must be pure.")
+    unchanged = all(map(np.array_equal, before, traj))
+    _require(unchanged, "A hook of the task family changes the trajectory that it is given: it must be pure.")
 
 
 def _check_hindsight(family: TaskFamily, episode: Episode) -> FloatArray:
     traj, length = episode.traj, len(episode.rewards)
-    tasks = np.stack([_call("hindsight_task fails.", family.hindsight_task, traj, index) for index in range(length)])
+    tasks = np.stack([family.hindsight_task(traj, index) for index in range(length)])
     _check_task_array(tasks, family, "What hindsight_task returned for each step")
     _require(
         not np.shares_memory(family.hindsight_task(traj, 0), traj.next_observations), "hindsight_task must return a copy."
@@ -239,10 +242,11 @@ def _check_sparse(family: TaskFamily, traj: Trajectory, own_tasks: FloatArray) -
 
 
 def _check_no_leak(plain: Episode, other: Episode) -> None:
+    same_ends = _same(plain.terminated, other.terminated)
+    _require(same_ends, "The task leaks into the end of the episode: same seed and actions, another task, another end.")
     same_states = _same(plain.traj.observations, other.traj.observations)
     same_states = same_states and _same(plain.traj.next_observations, other.traj.next_observations)
     _require(same_states, "The task leaks into the observations: same seed and actions, another task, other observations.")
-    _require(_same(plain.terminated, other.terminated), "The task leaks into the terminations: they must not depend on it.")
     same_free = _same(plain.traj.task_free_reward, other.traj.task_free_reward)
     _require(same_free, "info['task_free_reward'] depends on the task.")
 
@@ -253,11 +257,11 @@ def _check_episode(env: gym.Env[Any, Any], family: TaskFamily, seed: int) -> Non
     plain = _play(env, family, seed)
     in_range = 0 <= plain.task_id < len(family.train_tasks)
     _require(in_range, f"An env that was given no task had task_id {plain.task_id}: it must draw a training task.")
-    _check_rewards(env, family, plain, family.train_tasks[plain.task_id])
     traj = plain.traj
+    _check_pure(family, traj)
+    _check_rewards(env, family, plain, family.train_tasks[plain.task_id])
     own_tasks = _check_hindsight(family, plain)
     tasks = own_tasks[[0, len(own_tasks) // 2, -1]]
-    _check_pure(family, traj, tasks)
     _check_reward_types(family, traj, tasks[0])
 
     def dense_reward(steps: Trajectory, task: ArrayLike) -> FloatArray:

@@ -54,8 +54,8 @@ class TaskBank:
         """
         Order training tasks such that visiting them in this order finds an unknown task soon.
 
-        A greedy search under the belief that the unknown task is like one of the solved training tasks, all equally likely:
-        each visit goes where most belief is found, and thereafter the belief in what it should have found shrinks.
+        A greedy search under the belief that the unknown task is like one of the solved training tasks: each visit goes where
+        most belief is found, and thereafter the belief in what it should have found shrinks.
 
         :param buffer: names the columns of the episodes
         :param size: largest number of visits
@@ -67,8 +67,9 @@ class TaskBank:
         success = self.task_family.is_success(buffer.trajectory(episodes[:, None]), tasks)
         finds = (success & valid[:, None]).any(axis=-1)
         # Among equals, the task that its own episode solves best: its z is the most certain
-        preference = 1e-3 * self.best_return[solved] / self.best_return.max(initial=1e-9)
-        belief = np.ones(len(solved))
+        preference = 1e-6 * self.best_return[solved] / self.best_return.max(initial=1e-9)
+        # A task that few others resemble stands for more of the task space than one of many alike
+        belief = 1 / np.maximum(finds.sum(axis=0), 1)
         order: list[int] = []
         for _ in range(min(size, len(solved))):
             gain = finds @ belief + preference
