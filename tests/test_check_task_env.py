@@ -266,9 +266,9 @@ class OtherAchievedTask(LineEnv):
         return result
 
 
-@breaks("An env that was given no task had task_id 77")
+@breaks("After set_task(None) an episode had task_id 77")
 class IdOutOfRange(LineEnv):
-    task_id = property(lambda self: 77)  # type: ignore[assignment]
+    task_id = property(lambda self: 77)
 
 
 @breaks("compute_reward fails on an episode. It raised")
@@ -432,15 +432,6 @@ class DisturbedByHooks(LineEnv):
         return super().hindsight_task(traj, index)
 
 
-@breaks("compute_reward does not give the rewards that step gave")
-class OtherTaskMidway(LineEnv):
-    """Keeps the id and plays another task; found under a task that the episode solves."""
-
-    def _step_state(self, action: Any) -> Any:
-        self._current = (self.task_id, self.task + np.float32(0.01 * (self.n_steps % 2) - 0.005 + 0.02 * (self.n_steps == 0)))
-        return super()._step_state(action)
-
-
 @breaks("reset does not honour options={'task': vector}")
 class IgnoresVectors(LineEnv):
     def _give(self, key: str, value: Any) -> None:
@@ -449,7 +440,7 @@ class IgnoresVectors(LineEnv):
 
 @breaks("A task given as a vector had task_id 0")
 class VectorWithTrainingId(LineEnv):
-    task_id = property(lambda self: max(0, self._current_task()[0]))  # type: ignore[assignment]
+    task_id = property(lambda self: max(0, self._current_task()[0]))
 
 
 @breaks("reset does not honour options={'task_id': i}")
@@ -492,7 +483,7 @@ class SetTaskIgnoresVectors(LineEnv):
         super().set_task(None if isinstance(task, np.ndarray) else task)
 
 
-@breaks("set_task(None) does not go back to drawing tasks")
+@breaks("After set_task(None) an episode had task_id -1")
 class SetTaskIgnoresNone(LineEnv):
     def set_task(self, task: Any) -> None:
         if task is not None:
