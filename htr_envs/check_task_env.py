@@ -62,7 +62,7 @@ def _check_interface(env: gym.Env[Any, Any]) -> TaskFamily:
         _require(hasattr(family, name), f"The task family has no `{name}`: derive it from htr_envs.TaskFamily.")
     for what, space in (("observation_space", env.observation_space), ("action_space", env.action_space)):
         flat = isinstance(space, spaces.Box) and len(space.shape) == 1 and space.dtype == np.float32
-        _require(flat, f"The {what} is {space}, it must be a one-dimensional float32 Box.")
+        _require(flat, f"The {what} must be a one-dimensional float32 Box.")
     return family
 
 
@@ -75,7 +75,7 @@ def _check_task_array(tasks: Any, family: TaskFamily, name: str) -> None:
 
 def _check_family(family: TaskFamily) -> None:
     flat = isinstance(family.task_space, spaces.Box) and len(family.task_space.shape) == 1
-    _require(flat, f"The task space is {family.task_space}, it must be a one-dimensional Box.")
+    _require(flat, "The task space must be a one-dimensional Box.")
     seen: set[tuple[float, ...]] = set()
     for name in TASK_SETS:
         tasks = getattr(family, name)
@@ -94,10 +94,11 @@ def _check_family(family: TaskFamily) -> None:
 
 
 def _check_step(env: gym.Env[Any, Any], family: TaskFamily, observation: Any, reward: Any, info: dict[str, Any]) -> None:
-    seen = isinstance(observation, np.ndarray) and observation.dtype == np.float32 and bool(np.isfinite(observation).all())
+    float32 = isinstance(observation, np.ndarray) and observation.dtype == np.float32
     _require(
-        seen and observation in env.observation_space, f"The observation {observation!r} is not in the space, or not finite."
+        float32 and observation in env.observation_space, "An observation is not float32 or not in the observation space."
     )
+    _require(np.isfinite(observation).all(), "An observation has a number that is not finite.")
     _require(isinstance(reward, float) and bool(np.isfinite(reward)), f"The reward {reward!r} is not a finite float.")
     for key, kind in (("task_id", int), ("is_success", bool), ("achieved_task", np.ndarray), ("task_free_reward", float)):
         _require(key in info, f"The info of step lacks `{key}`.")
@@ -207,15 +208,12 @@ def _check_hindsight(family: TaskFamily, episode: Episode) -> FloatArray:
     traj, length = episode.traj, len(episode.rewards)
     tasks = np.stack([family.hindsight_task(traj, index) for index in range(length)])
     _check_task_array(tasks, family, "What hindsight_task returned for each step")
-    _require(
-        not np.shares_memory(family.hindsight_task(traj, 0), traj.next_observations), "hindsight_task must return a copy."
-    )
+    view = np.shares_memory(family.hindsight_task(traj, 0), traj.next_observations)
+    _require(not view, "hindsight_task must return a copy.")
     _require(_same(tasks, episode.achieved_tasks), "info['achieved_task'] is not the hindsight_task of its step.")
     for index, task in enumerate(tasks):
         solved = bool(family.is_success(traj, task)[index])
-        _require(
-            solved, f"The state that hindsight_task was asked for does not solve it, at step {index} of a random episode."
-        )
+        _require(solved, f"The state that hindsight_task was asked for does not solve it, at step {index} of an episode.")
 
     vectorized = "hindsight_task is not vectorized: `index` must broadcast with the leading axes of the trajectory."
     indices = np.array([0, length // 2, length - 1])
@@ -315,7 +313,7 @@ def _check_bad_options(env: gym.Env[Any, Any], family: TaskFamily) -> None:
         {"task_id": len(family.train_tasks)},
         {"task_id": -1},
         {"task": np.full_like(family.train_tasks[0], np.nan)},
-        {"task": family.train_tasks},
+        {"task": np.append(family.train_tasks[0], 0.0)},
         {"no_such_option": 0},
     ]
     for options in bad:

@@ -123,13 +123,13 @@ def test_a_family_without(name: str) -> None:
 def test_spaces_of_another_type(name: str) -> None:
     env = LineEnv()
     setattr(env, name, spaces.Box(-1.0, 1.0, (1,), np.float64))
-    assert_refused(env, f"The {name} is Box")
+    assert_refused(env, f"The {name} must be a one-dimensional float32 Box")
 
 
 @pytest.mark.parametrize(
     ("name", "value", "sentence"),
     [
-        ("task_space", spaces.Discrete(3), "The task space is Discrete(3)"),
+        ("task_space", spaces.Discrete(3), "The task space must be a one-dimensional Box"),
         ("train_tasks", np.ones((2, 1)), "train_tasks must be a float32 array"),
         (
             "train_tasks",
@@ -227,10 +227,26 @@ class SilentReset(LineEnv):
         return super().reset(**kwargs)[0], {}
 
 
-@breaks("is not in the space, or not finite")
-class NanObservation(LineEnv):
+@breaks("An observation is not float32 or not in the observation space")
+class Float64Observation(LineEnv):
     def alter(self, observation: Any, *others: Any) -> Any:
-        return np.full_like(observation, np.nan), *others
+        return observation.astype(np.float64), *others
+
+
+@breaks("An observation is not float32 or not in the observation space")
+class ObservationOutOfSpace(LineEnv):
+    def alter(self, observation: Any, *others: Any) -> Any:
+        return observation + np.float32(9.0), *others
+
+
+@breaks("An observation has a number that is not finite")
+class InfiniteObservation(LineEnv):
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+
+    def alter(self, observation: Any, *others: Any) -> Any:
+        return np.full_like(observation, np.inf), *others
 
 
 @breaks("The reward nan is not a finite float")
@@ -307,6 +323,20 @@ class Float64Reward(LineFamily):
 class OneRewardForAll(LineFamily):
     def compute_reward(self, *args: Any) -> Any:
         return super().compute_reward(*args)[..., :1]
+
+
+@breaks("compute_reward returned a number that is not finite")
+class InfiniteReward(LineFamily):
+    def compute_reward(self, traj: Any, *args: Any) -> Any:
+        return super().compute_reward(traj, *args) + np.float32(0.0 if len(traj.actions) == 1 else np.inf)
+
+
+@breaks("compute_reward fails on some steps of an episode. It raised")
+class WholeEpisodesOnly(LineFamily):
+    def compute_reward(self, traj: Any, *args: Any) -> Any:
+        if traj.actions.shape[-2] == 6:
+            raise ValueError("no end of the episode")
+        return super().compute_reward(traj, *args)
 
 
 @breaks("compute_reward does not give the rewards that step gave")

@@ -47,9 +47,7 @@ class CheckpointCallback(BaseCallback):
     :param verbose: 1 says where checkpoints are written
     """
 
-    def __init__(
-        self, save_freq: int, save_path: str, name_prefix: str = "rl_model", keep: int = 2, verbose: int = 0
-    ) -> None:
+    def __init__(self, save_freq: int, save_path: str, name_prefix: str = "rl_model", keep: int = 2, verbose: int = 0) -> None:
         super().__init__(verbose)
         self.save_freq = save_freq
         self.folder = Path(save_path) / "checkpoints"

@@ -1,6 +1,6 @@
 """Meta-test: how well does an agent adapt to tasks that it has never seen?"""
 
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import gymnasium as gym
 import numpy as np
@@ -28,7 +28,10 @@ class AdaptsToTasks(Protocol):
 class MetaLearner(Protocol):
     """What :func:`evaluate_adaptation` asks of a model; :class:`sb3_htr.PEARL` is one."""
 
-    policy: BasePolicy
+    @property
+    def policy(self) -> Any:
+        """Networks, an SB3 policy."""
+        ...
 
     def start_adaptation(
         self,
@@ -70,13 +73,13 @@ def run_adaptation(
     """
     n_envs = env.num_envs
     obs = env.reset()
-    assert isinstance(obs, np.ndarray)
     episode, envs = np.zeros(n_envs, dtype=np.int64), np.arange(n_envs)
     returns = np.zeros((n_envs, n_episodes + 1))
     successes = np.zeros((n_envs, n_episodes + 1), dtype=bool)
     steps: list[np.ndarray] = []
     episode_of_step: list[np.ndarray] = []
     while (episode < n_episodes).any():
+        assert isinstance(obs, np.ndarray)
         actions, _ = policy.predict(obs, (adaptation.z,), deterministic=deterministic)
         new_obs, rewards, dones, infos = env.step(actions)
         # Envs that are ahead of the others write to a column that is cut off
@@ -87,7 +90,7 @@ def run_adaptation(
         episode_of_step.append(column)
         task_free = np.array([info["task_free_reward"] for info in infos])
         adaptation.observe(obs, policy.scale_action(actions), rewards, task_free, dones)
-        obs = new_obs  # type: ignore[assignment]
+        obs = new_obs
         episode += dones
     achieved = _by_episode(np.stack(steps, axis=1), np.stack(episode_of_step, axis=1), n_episodes)
     return AdaptationRecord(returns[:, :n_episodes], successes[:, :n_episodes], achieved)

@@ -66,7 +66,7 @@ class BatchedTaskVecEnv(VecEnv):
         self.vector_env.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        return [getattr(self.vector_env, attr_name)] * len(self._get_indices(indices))
+        return [getattr(self.vector_env, attr_name)] * len(list(self._get_indices(indices)))
 
     def has_attr(self, attr_name: str) -> bool:
         return hasattr(self.vector_env, attr_name)
@@ -76,10 +76,10 @@ class BatchedTaskVecEnv(VecEnv):
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
         # One call serves the whole batch
-        return [getattr(self.vector_env, method_name)(*args, **kwargs)] * len(self._get_indices(indices))
+        return [getattr(self.vector_env, method_name)(*args, **kwargs)] * len(list(self._get_indices(indices)))
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        return [False] * len(self._get_indices(indices))
+        return [False] * len(list(self._get_indices(indices)))
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         return [None] * self.num_envs

@@ -147,7 +147,9 @@ def plot(results: dict[Cell, Path], path: Path) -> None:
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.25)
         axes.legend(frameon=False, fontsize=8)
-    figure.suptitle(f"{next(iter(results)).env_id}: IQM over {len(next(iter(groups.values())))} seeds, 95 % interval", fontsize=11)
+    figure.suptitle(
+        f"{next(iter(results)).env_id}: IQM over {len(next(iter(groups.values())))} seeds, 95 % interval", fontsize=11
+    )
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=110)
     plt.close(figure)

@@ -86,6 +86,10 @@ class EpisodeStore:
         self._new = []
         return self._data[slots], self._lengths[slots]
 
+    def forget_taken(self) -> None:
+        """Let :meth:`take_new` return every stored episode again."""
+        self._new = list(range(self._n_slots))
+
     def _allocate(self) -> int:
         if self._n_slots == len(self._data):
             n_slots = min(max(16, 2 * len(self._data)), self.n_tasks * self.episodes_per_task)

@@ -191,13 +191,13 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             self._raise_not_finite(self._open[env, step], task)
         self._open_task = task
         self._open_length = step + 1
-        for i in np.flatnonzero(done):
-            self.episodes.add(task[i], self._open[i, : self._open_length[i]])
-            self._open_length[i] = 0
+        for ended in np.flatnonzero(done):
+            self.episodes.add(task[ended], self._open[ended, : self._open_length[ended]])
+            self._open_length[ended] = 0
 
     def _raise_not_finite(self, rows: np.ndarray, task: np.ndarray) -> None:
         i = int((~np.isfinite(rows)).any(axis=1).argmax())
-        columns = {
+        columns: dict[str, slice | int] = {
             "observation": self._obs,
             "action": self._action,
             "reward": self._reward,
@@ -306,9 +306,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         length = np.minimum(end - start, context_size)
         return spread(rng, start, end - start, length, context_size), length
 
-    def _write_rewards(
-        self, rows: np.ndarray, where: np.ndarray, steps: slice, task: np.ndarray, reward_type: str
-    ) -> None:
+    def _write_rewards(self, rows: np.ndarray, where: np.ndarray, steps: slice, task: np.ndarray, reward_type: str) -> None:
         """Give ``rows[where, steps]`` the reward of ``task[where]``, in one call of the reward hook."""
         traj = self.trajectory(rows[where, steps])
         reward = self.task_family.compute_reward(traj, task[where], reward_type=reward_type)

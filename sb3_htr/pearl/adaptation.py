@@ -104,14 +104,15 @@ class Adaptation:
     def _sample_posterior(self, envs: np.ndarray) -> np.ndarray:
         row = np.arange(self._n_rows[envs].max())
         if self.explorer is Explorer.PRIOR:
-            mask, widening = row < self._n_rows[envs, None], np.ones((len(envs), 1))
+            mask = row < self._n_rows[envs, None]
         else:
             # Meta-training sees contexts of one rewarded episode; the misses of a search would look like nothing it knows
             mask = (row >= self._best[envs, :1]) & (row < self._best[envs, 1:])
-            widening = 1.0 + self._setbacks[envs, None]
         device = self.policy.device
         with th.no_grad():
             context = th.as_tensor(self._rows[envs, : len(row)], device=device)
             mean, variance = self.policy.encoder(context, th.as_tensor(mask, dtype=th.float32, device=device))
-        noise = th.randn(mean.shape, generator=self.generator).numpy()
-        return mean.cpu().numpy() + widening * variance.sqrt().cpu().numpy() * noise
+        deviation = variance.sqrt().cpu().numpy()
+        if self.explorer is not Explorer.PRIOR:
+            deviation *= 1 + self._setbacks[envs, None]
+        return mean.cpu().numpy() + deviation * th.randn(mean.shape, generator=self.generator).numpy()

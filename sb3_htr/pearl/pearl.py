@@ -3,7 +3,7 @@
 import io
 import pathlib
 import warnings
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar, cast
 
 import gymnasium as gym
 import numpy as np
@@ -26,6 +26,7 @@ from sb3_htr.pearl.adapted_agent import AdaptedAgent
 from sb3_htr.pearl.encoder import ContextEncoder, kl_to_prior
 from sb3_htr.pearl.exploration import to_explorer
 from sb3_htr.pearl.policies import LatentCritic, MlpPolicy, PEARLPolicy
+from sb3_htr.pearl.rollout import collect_adaptations
 from sb3_htr.pearl.task_bank import TaskBank
 
 SelfPEARL = TypeVar("SelfPEARL", bound="PEARL")
@@ -80,7 +81,7 @@ class PEARL(SAC):
     critic: LatentCritic  # type: ignore[assignment]
     critic_target: LatentCritic  # type: ignore[assignment]
     encoder: ContextEncoder
-    replay_buffer: MultiTaskReplayBuffer | None  # type: ignore[assignment]
+    replay_buffer: MultiTaskReplayBuffer | None
 
     def __init__(
         self,
@@ -132,7 +133,7 @@ class PEARL(SAC):
             env = self._wrap_env(env)
             checks.check_spaces(env)
         super().__init__(
-            policy=policy,  # type: ignore[arg-type]
+            policy=policy,
             env=env,  # type: ignore[arg-type]
             learning_rate=learning_rate,
             buffer_size=buffer_size,
@@ -167,6 +168,7 @@ class PEARL(SAC):
         self.task_bank: TaskBank | None = None
         # Training tasks in the order of the coming rollouts: every task once, then every task once in another order
         self._task_queue = np.zeros(0, dtype=np.int64)
+        self._n_rollouts = 0
         self._warned_not_adapted = False
         if _init_setup_model:
             self._setup_model()
@@ -184,8 +186,8 @@ class PEARL(SAC):
     def _setup_replay(self, env: VecEnv) -> None:
         checks.check_reward_is_not_normalized(env)
         family: TaskFamily = checks.get_task_family(env)
-        assert self.replay_buffer_class is not None
-        self.replay_buffer = self.replay_buffer_class(  # type: ignore[assignment]
+        replay_buffer_class = cast(type[MultiTaskReplayBuffer], self.replay_buffer_class)
+        self.replay_buffer = replay_buffer_class(
             self.buffer_size,
             self.observation_space,
             self.action_space,
@@ -221,7 +223,7 @@ class PEARL(SAC):
         if isinstance(self.replay_buffer, MultiTaskReplayBuffer) and seed is not None:
             self.replay_buffer.seed(seed)
 
-    def learn(  # type: ignore[override]
+    def learn(
         self: SelfPEARL,
         total_timesteps: int = 150_000,
         callback: MaybeCallback = None,
@@ -250,14 +252,6 @@ class PEARL(SAC):
             progress_bar=progress_bar,
         )
 
-    def _next_tasks(self, n: int) -> np.ndarray:
-        assert self.task_bank is not None
-        n_tasks = len(self.task_bank.task_family.train_tasks)
-        while len(self._task_queue) < n:
-            self._task_queue = np.append(self._task_queue, self._rng.permutation(n_tasks))
-        tasks, self._task_queue = self._task_queue[:n], self._task_queue[n:]
-        return tasks
-
     def collect_rollouts(  # type: ignore[override]
         self,
         env: VecEnv,
@@ -271,8 +265,6 @@ class PEARL(SAC):
         """
         Adapt to ``n_tasks_per_rollout`` training tasks, one per env at a time, and store all that happens.
 
-        Envs that finish their episodes before the others go on with more of them.
-
         :param env: training env
         :param callback: called at every step
         :param train_freq: not used, a rollout is whole adaptations
@@ -285,51 +277,18 @@ class PEARL(SAC):
         assert self.task_bank is not None
         self.policy.set_training_mode(False)
         callback.on_rollout_start()
-        n_steps, n_episodes = 0, 0
-        for _ in range(-(-self.n_tasks_per_rollout // env.num_envs)):
-            env.set_options([{"task_id": int(task)} for task in self._next_tasks(env.num_envs)])
-            self._last_obs = env.reset()  # type: ignore[assignment]
-            checks.check_task_ids(env)
-            if self._vec_normalize_env is not None:
-                self._last_original_obs = self._vec_normalize_env.get_original_obs()
-            replay_buffer.discard_open_episodes()
-            adaptation = self.start_adaptation(env.num_envs, explorer=self.train_explorer)
-            remaining = np.full(env.num_envs, self.n_episodes_per_task)
-            while (remaining > 0).any():
-                obs = self._last_obs
-                actions, buffer_actions = self._choose_actions(adaptation, learning_starts)
-                new_obs, rewards, dones, infos = env.step(actions)
-                self.num_timesteps += env.num_envs
-                n_steps += env.num_envs
-                # Give access to local variables
-                callback.update_locals(locals())
-                if not callback.on_step():
-                    return RolloutReturn(n_steps, n_episodes, continue_training=False)
-                self._update_info_buffer(infos, dones)
-                self._store_transition(replay_buffer, buffer_actions, new_obs, rewards, dones, infos)  # type: ignore[arg-type]
-                task_free = np.array([info.get("task_free_reward", 0.0) for info in infos])
-                adaptation.observe(obs, buffer_actions, rewards, task_free, dones)  # type: ignore[arg-type]
-                self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
-                remaining -= dones
-                n_episodes += int(dones.sum())
+        rollout = collect_adaptations(self, env, callback, replay_buffer, learning_starts)
+        if not rollout.continue_training:
+            return rollout
         self.task_bank.update(replay_buffer)
+        self.logger.record("rollout/train_tasks_reached", len(self.task_bank.solved))
         callback.on_rollout_end()
-        self._episode_num += n_episodes
-        self._n_rollouts = getattr(self, "_n_rollouts", 0) + 1
+        self._n_rollouts += 1
         if log_interval is not None and self._n_rollouts % log_interval == 0:
             self.dump_logs()
-        return RolloutReturn(n_steps, n_episodes, continue_training=True)
+        return rollout
 
-    def _choose_actions(self, adaptation: Adaptation, learning_starts: int) -> tuple[np.ndarray, np.ndarray]:
-        """Actions for the envs, and the same scaled to [-1, 1]."""
-        if self.num_timesteps < learning_starts:
-            scaled = self._rng.uniform(-1, 1, (self.n_envs, *self.action_space.shape)).astype(np.float32)  # type: ignore[misc]
-            return self.policy.unscale_action(scaled), scaled
-        assert isinstance(self._last_obs, np.ndarray)
-        actions, _ = self.policy.predict(self._last_obs, (adaptation.z,))
-        return actions, self.policy.scale_action(actions)
-
-    def train(self, gradient_steps: int, batch_size: int) -> None:
+    def train(self, gradient_steps: int, batch_size: int = 16) -> None:
         """
         Update encoder, critics and actor, then what is known about z before a reward.
 
@@ -342,7 +301,8 @@ class PEARL(SAC):
         if self.ent_coef_optimizer is not None:
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
-        critic_parameters, target_parameters = list(self.critic.parameters()), list(self.critic_target.parameters())
+        critic_parameters: list[th.Tensor] = list(self.critic.parameters())
+        target_parameters: list[th.Tensor] = list(self.critic_target.parameters())
         means: list[th.Tensor] = []
         logs: list[dict[str, th.Tensor]] = []
         for _ in range(gradient_steps):
@@ -383,7 +343,7 @@ class PEARL(SAC):
             self.critic.requires_grad_(True)
 
             if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
-                ent_coef_loss = -(self.log_ent_coef * (log_prob.detach().mean() + self.target_entropy)).mean()
+                ent_coef_loss = -(self.log_ent_coef * (log_prob.detach().mean() + float(self.target_entropy))).mean()
                 self.ent_coef_optimizer.zero_grad()
                 ent_coef_loss.backward()
                 self.ent_coef_optimizer.step()
@@ -415,10 +375,11 @@ class PEARL(SAC):
         assert self.replay_buffer is not None and self.task_bank is not None
         prior = self.policy.latent_prior
         prior.set_aggregate(means)
-        solved = len(self.task_bank.solved)
-        self.logger.record("rollout/train_tasks_reached", solved)
-        if solved > 0:
+        if len(self.task_bank.solved) > 0:
             context, mask = self.task_bank.search_plan(self.replay_buffer, prior.plan_size)
+            if self._vec_normalize_env is not None:
+                obs = slice(0, self.replay_buffer.obs_dim)
+                context[..., obs] = self._vec_normalize_env.normalize_obs(context[..., obs])
             with th.no_grad():
                 plan, _ = self.encoder(th.as_tensor(context, device=self.device), th.as_tensor(mask, device=self.device))
             prior.set_plan(plan)
@@ -474,7 +435,9 @@ class PEARL(SAC):
         adaptation = self.start_adaptation(1, None, explorer, th.Generator().manual_seed(seed))
         record = run_adaptation(self.policy, vec_env, adaptation, n_episodes, deterministic)
         if adaptation.best_return[0] <= 0:
-            warnings.warn(f"No reward was found in {n_episodes} episodes, so the agent is not adapted: allow more.", stacklevel=2)
+            warnings.warn(
+                f"No reward was found in {n_episodes} episodes, so the agent is not adapted: allow more.", stacklevel=2
+            )
         return AdaptedAgent(self.policy, adaptation.z[0].copy(), record.returns[0], record.successes[0])
 
     def predict(  # type: ignore[override]
@@ -501,14 +464,16 @@ class PEARL(SAC):
             )
         return self.policy.predict(observation, state, episode_start, deterministic)
 
-    def load_replay_buffer(
-        self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True
-    ) -> None:
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """
         :param path: file of ``save_replay_buffer``
         :param truncate_last_traj: not used, only whole episodes are stored
         """
         super().load_replay_buffer(path, truncate_last_traj)
+        assert self.replay_buffer is not None
+        self.replay_buffer.episodes.forget_taken()
+        self.task_bank = TaskBank(self.replay_buffer.task_family)
+        self.task_bank.update(self.replay_buffer)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "encoder", "task_bank"]

@@ -1,6 +1,7 @@
 """Networks of PEARL: SAC's actor and critics conditioned on the task variable z, and the context encoder."""
 
 import math
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -58,7 +59,7 @@ class LatentCritic(BaseModel):
         super().__init__(observation_space, action_space)
         self.n_critics = n_critics
         units = [observation_space.shape[0] + action_space.shape[0], *net_arch]
-        self.layers = nn.ModuleList(EnsembleLinear(n_critics, i, o) for i, o in zip(units[:-1], units[1:], strict=True))
+        self.layers = nn.ModuleList(EnsembleLinear(n_critics, i, o) for i, o in pairwise(units))
         self.scales = nn.ParameterList(th.ones(n_critics, 1, o) for o in net_arch)
         self.shifts = nn.ParameterList(th.zeros(n_critics, 1, o) for o in net_arch)
         self.output = EnsembleLinear(n_critics, units[-1], 1)
@@ -114,7 +115,7 @@ class PEARLPolicy(SACPolicy):
         self.context_dim = obs_dim + int(np.prod(action_space.shape)) + 1
         # SB3's networks are built for the observation (o, z)
         super().__init__(
-            spaces.Box(-np.inf, np.inf, (obs_dim + latent_dim,), np.float32),  # type: ignore[arg-type]
+            spaces.Box(-np.inf, np.inf, (obs_dim + latent_dim,), np.float32),
             action_space,
             lr_schedule,
             net_arch=[128, 128] if net_arch is None else net_arch,
@@ -139,7 +140,7 @@ class PEARLPolicy(SACPolicy):
         self.critic_target.requires_grad_(False)
 
     def make_critic(self, features_extractor: nn.Module | None = None) -> LatentCritic:  # type: ignore[override]
-        kwargs = self.critic_kwargs
+        kwargs: dict[str, Any] = self.critic_kwargs
         return LatentCritic(
             kwargs["observation_space"],
             kwargs["action_space"],

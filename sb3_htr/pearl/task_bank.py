@@ -5,8 +5,10 @@ import numpy as np
 from sb3_htr.common.type_aliases import TaskFamily
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 
-# Chance that an episode finds a task that it should find. Below 1, the plan comes back to places that it was at, by other ways.
+# Chance that an episode finds a task that it should find. Below 1, the plan comes back to places where it has been.
 DETECTION_PROBABILITY = 0.8
+# Episodes rewarded under all training tasks at a time, to bound memory
+CHUNK = 256
 
 
 class TaskBank:
@@ -30,9 +32,11 @@ class TaskBank:
         """
         :param buffer: the episodes added to it since the last call are rewarded under every training task
         """
-        episodes, length = buffer.episodes.take_new()
-        if len(episodes) == 0:
-            return
+        new, lengths = buffer.episodes.take_new()
+        for start in range(0, len(new), CHUNK):
+            self._update(buffer, new[start : start + CHUNK], lengths[start : start + CHUNK])
+
+    def _update(self, buffer: MultiTaskReplayBuffer, episodes: np.ndarray, length: np.ndarray) -> None:
         if self.episodes.size == 0:
             self.episodes = np.zeros((len(self.length), *episodes.shape[1:]), dtype=np.float32)
         traj = buffer.trajectory(episodes[:, None])
@@ -65,7 +69,7 @@ class TaskBank:
         episodes, tasks = self.episodes[solved], self.task_family.train_tasks[solved]
         valid = np.arange(episodes.shape[1]) < self.length[solved, None]
         success = self.task_family.is_success(buffer.trajectory(episodes[:, None]), tasks)
-        finds = (success & valid[:, None]).any(axis=-1)
+        finds = np.any(success & valid[:, None], axis=-1)
         # Among equals, the task that its own episode solves best: its z is the most certain
         preference = 1e-6 * self.best_return[solved] / self.best_return.max(initial=1e-9)
         # A task that few others resemble stands for more of the task space than one of many alike

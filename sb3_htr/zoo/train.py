@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from datetime import datetime, timezone
 from importlib.metadata import version
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import gymnasium as gym
@@ -100,10 +101,16 @@ def register() -> None:
     """Make PEARL known to rl_zoo3, in this process."""
     ALGOS["pearl"] = PEARL
     # rl_zoo3 looks these names up when it needs them
-    exp_manager.EvalCallback = MetaEvalCallback
-    exp_manager.TrialEvalCallback = MetaTrialEvalCallback
-    exp_manager.CheckpointCallback = CheckpointCallback
-    rl_zoo3.train.ExperimentManager = MetaExperimentManager
+    replaced: dict[ModuleType, dict[str, type]] = {
+        exp_manager: {
+            "EvalCallback": MetaEvalCallback,
+            "TrialEvalCallback": MetaTrialEvalCallback,
+            "CheckpointCallback": CheckpointCallback,
+        },
+        rl_zoo3.train: {"ExperimentManager": MetaExperimentManager},
+    }
+    for module, classes in replaced.items():
+        vars(module).update(classes)
 
 
 def check_hyperparams(path: str) -> None:
