@@ -3,6 +3,7 @@
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from sb3_htr.experiments.report import write
 from sb3_htr.experiments.runner import Cell, run_cells
@@ -14,19 +15,18 @@ def cells(n_seeds: int, n_timesteps: int) -> list[Cell]:
     """
     :param n_seeds: runs per method
     :param n_timesteps: budget of env steps
-    :return: HTR with this library's defaults; PEARL as its paper has it: no relabelling, z from N(0, I) when exploring
+    :return: HTR with this library's defaults; PEARL as its paper has it: no relabelling, z from N(0, I) when exploring; and
+        the defaults but for the relabelling
     """
-    plain = {
-        "replay_buffer_kwargs": {"relabel_probability": 0.0},
-        "train_explorer": "prior",
-        "explorer": "prior",
-    }
+    no_relabelling: dict[str, Any] = {"replay_buffer_kwargs": {"relabel_probability": 0.0}}
+    plain = {**no_relabelling, "train_explorer": "prior", "explorer": "prior"}
     return [
         cell
         for seed in range(1, n_seeds + 1)
         for cell in (
             Cell(ENV_ID, "htr-ser", seed, n_timesteps),
             Cell(ENV_ID, "pearl-sparse", seed, n_timesteps, hyperparams=plain, explorers=("prior",)),
+            Cell(ENV_ID, "pearl-sparse-search", seed, n_timesteps, hyperparams=no_relabelling),
         )
     ]
 

@@ -15,7 +15,7 @@ from sb3_htr.htr.hindsight_task import HindsightTaskStrategy, select_step, to_hi
 
 def spread(rng: np.random.Generator, start: np.ndarray, length: np.ndarray, size: np.ndarray, width: int) -> np.ndarray:
     """
-    Draw integers of ranges, evenly spread: one from each of ``size`` equal parts of the range.
+    Draw integers of ranges, evenly spread: one from each of ``size`` parts of the range.
 
     Every integer has the same chance to be drawn, and none is drawn twice while ``size <= length``: a product of Gaussians
     would count a duplicate in the context as evidence.
@@ -25,11 +25,15 @@ def spread(rng: np.random.Generator, start: np.ndarray, length: np.ndarray, size
     :param length: (n,) int, number of integers in each range
     :param size: (n,) int, how many to draw from each range, at most ``width``
     :param width: number of columns of the result
-    :return: (n, width) int; columns from ``size`` on repeat the last draw
+    :return: (n, width) int; columns from ``size`` on hold any integer of the range
     """
+    n = len(start)
     part = np.minimum(np.arange(width), size[:, None] - 1)
-    position = (part + rng.random((len(start), width))) * (length / size)[:, None]
-    return start[:, None] + np.minimum(position.astype(np.int64), length[:, None] - 1)
+    first, end = (edge * length[:, None] // size[:, None] for edge in (part, part + 1))
+    position = first + (rng.random((n, width)) * (end - first)).astype(np.int64)
+    # Parts differ in size by one, which a random rotation of the range makes up for
+    rotation = (rng.random(n) * length).astype(np.int64)
+    return start[:, None] + (position + rotation[:, None]) % length[:, None]
 
 
 class MultiTaskReplayBuffer(ReplayBuffer):

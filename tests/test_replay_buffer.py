@@ -1,0 +1,278 @@
+"""Promises of the replay buffer and of relabelling."""
+
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import add_episode, make_buffer
+from hypothesis import given
+from hypothesis import strategies as st
+
+from htr_envs import PointRobotFamily
+from sb3_htr.common.type_aliases import MultiTaskSamples
+from sb3_htr.htr.episode_store import EpisodeStore
+from sb3_htr.htr.multi_task_replay_buffer import spread
+
+FAMILY = PointRobotFamily()
+
+
+def filled(walk_seed: int = 0, n_episodes: int = 6, lengths: tuple[int, ...] = (20,), **kwargs: Any):  # type: ignore[no-untyped-def]
+    rng = np.random.default_rng(walk_seed)
+    buffer = make_buffer(FAMILY, **kwargs)
+    for i in range(n_episodes):
+        add_episode(buffer, [i % 3, 3 + i % 4], lengths[i % len(lengths)], rng)
+    return buffer
+
+
+def assert_same(a: MultiTaskSamples, b: MultiTaskSamples) -> None:
+    for name, x, y in zip(a._fields, a, b, strict=True):
+        assert (np.asarray(x) == np.asarray(y)).all(), name
+
+
+# --- spread: how rows are drawn
+
+
+@given(st.integers(0, 1000), st.lists(st.tuples(st.integers(0, 50), st.integers(1, 40)), min_size=1, max_size=5), st.data())
+def test_spread_stays_in_range_and_repeats_only_if_it_must(seed: int, ranges: list[tuple[int, int]], data: Any) -> None:
+    start, length = np.array(ranges).T
+    width = data.draw(st.integers(1, 60))
+    size = np.array([data.draw(st.integers(1, width)) for _ in ranges])
+    drawn = spread(np.random.default_rng(seed), start, length, size, width)
+    assert drawn.shape == (len(ranges), width)
+    assert (drawn >= start[:, None]).all() and (drawn < (start + length)[:, None]).all()
+    for row, n, m in zip(drawn, size, length, strict=True):
+        counts = np.unique(row[:n], return_counts=True)[1]
+        assert counts.max() <= -(-n // m), "repeated more often than it must"
+
+
+def test_spread_gives_every_row_the_same_chance() -> None:
+    n = 20_000
+    drawn = spread(np.random.default_rng(0), np.zeros(n, int), np.full(n, 7), np.full(n, 3), 3)
+    frequency = np.bincount(drawn.ravel(), minlength=7) / n
+    np.testing.assert_allclose(frequency, 3 / 7, atol=0.02)
+
+
+# --- storage
+
+
+@given(st.lists(st.tuples(st.integers(0, 2), st.integers(1, 4)), max_size=40))
+def test_store_keeps_the_latest_episodes_of_each_task_in_order(added: list[tuple[int, int]]) -> None:
+    store = EpisodeStore(n_tasks=3, episodes_per_task=3, episode_length=4, row_dim=1)
+    kept: list[list[list[float]]] = [[], [], []]
+    for number, (task, length) in enumerate(added):
+        store.add(task, np.full((length, 1), number, dtype=np.float32))
+        kept[task] = [*kept[task], [float(number)] * length][-3:]
+    index = store.index()
+    assert index.tasks.tolist() == [task for task in range(3) if kept[task]]
+    for task in range(3):
+        rows = store.rows[index.rows[index.task_row[task] : index.task_row[task + 1]], 0]
+        assert rows.tolist() == [value for episode in kept[task] for value in episode]
+        starts = index.episode_row[index.task_episode[task] : index.task_episode[task + 1]]
+        assert len(starts) == len(kept[task])
+
+
+def test_store_hands_out_each_new_episode_once_and_costs_nothing_when_empty() -> None:
+    store = EpisodeStore(n_tasks=1000, episodes_per_task=1000, episode_length=1000, row_dim=100)
+    assert store.nbytes == 0
+    store.add(3, np.ones((2, 100), dtype=np.float32))
+    assert store.take_new()[1].tolist() == [2]
+    assert len(store.take_new()[0]) == 0
+    store.forget_taken()
+    assert len(store.take_new()[0]) == 1
+
+
+def test_only_complete_episodes_can_be_sampled() -> None:
+    buffer = make_buffer(FAMILY, n_envs=1)
+    step = np.zeros((1, 2), dtype=np.float32)
+    buffer.add(step, step, step, np.zeros(1), np.zeros(1, bool), [{"task_id": 0, "task_free_reward": 0.0}])
+    assert buffer.size() == 0
+    with pytest.raises(ValueError, match="no complete episode"):
+        buffer.sample(4)
+    buffer.discard_open_episodes()
+    add_episode(buffer, [5], 20, np.random.default_rng(0))
+    assert buffer.size() == 20 and buffer.n_episodes[5] == 1
+    buffer.reset()
+    assert buffer.size() == 0
+
+
+def test_a_time_limit_is_not_a_termination() -> None:
+    for terminated in (False, True):
+        buffer = make_buffer(FAMILY, relabel_probability=0)
+        add_episode(buffer, [0, 1], 5, np.random.default_rng(0), terminated=terminated)
+        assert buffer.sample(5).dones.max() == float(terminated)
+
+
+# --- relabelling
+
+
+@given(st.integers(0, 2**20), st.sampled_from([(20,), (1, 7, 20)]), st.floats(0, 1))
+def test_every_reward_is_that_of_one_task_per_row(seed: int, lengths: tuple[int, ...], k: float) -> None:
+    """Rows that are not relabelled keep the env's reward; relabelled ones carry the reward of one task that was reached."""
+    buffer = filled(seed, lengths=lengths, relabel_probability=k, seed=seed)
+    data = buffer.sample(8, meta_batch_size=16, context_size=20)
+    assert all(np.asarray(x).dtype == np.float32 for x in data[:7])
+    own = FAMILY.train_tasks[data.task_ids]
+    traj = _context_traj(data)
+    valid = data.context_mask.numpy() == 1
+    reward = data.context[..., -1].numpy()
+    np.testing.assert_array_equal(
+        reward[~data.relabelled], FAMILY.compute_reward(traj, own)[~data.relabelled], err_msg="own task"
+    )
+    # A relabelled context of a whole episode has the step that reached the hindsight task
+    assert ((reward > 0) & valid).any(axis=1)[data.relabelled].all()
+    for row in np.flatnonzero(data.relabelled):
+        reached = traj.next_observations[row]  # the task that a state solves is the place itself
+        candidates = FAMILY.compute_reward(_rows(traj, row), reached)
+        assert (candidates == reward[row]).all(axis=1).any(), "no reached state gives these rewards"
+
+
+def _context_traj(data: MultiTaskSamples):  # type: ignore[no-untyped-def]
+    from htr_envs import Trajectory
+
+    context = data.context.numpy()
+    obs, action = context[..., :2], context[..., 2:4]
+    return Trajectory(obs, action, (obs + 0.1 * action).astype(np.float32), np.zeros(obs.shape[:2], dtype=np.float32))
+
+
+def _rows(traj: Any, row: int) -> Any:
+    return type(traj)(*(x[row][None] for x in traj))
+
+
+@pytest.mark.parametrize("k", [0.0, 1.0])
+def test_k_zero_and_one_mean_never_and_always(k: float) -> None:
+    buffer = filled(relabel_probability=k)
+    relabelled = np.concatenate([buffer.sample(4, meta_batch_size=64).relabelled for _ in range(20)])
+    assert relabelled.all() if k else not relabelled.any()
+
+
+def test_k_is_the_probability_of_relabelling() -> None:
+    buffer = filled(relabel_probability=0.3)
+    share = np.mean([buffer.sample(1, meta_batch_size=200).relabelled.mean() for _ in range(50)])
+    assert abs(share - 0.3) < 0.02
+
+
+def test_relabelling_leaves_the_other_rows_alone_bit_for_bit() -> None:
+    """K = 0 is plain PEARL: rows that are not relabelled are the same whatever K is."""
+    plain, mixed = filled(relabel_probability=0.0), filled(relabel_probability=0.5)
+    for _ in range(5):
+        a, b = plain.sample(8, meta_batch_size=32), mixed.sample(8, meta_batch_size=32)
+        same = ~b.relabelled
+        assert same.any() and not same.all()
+        for name, x, y in zip(a._fields[:-1], a, b, strict=False):
+            assert (np.asarray(x)[same] == np.asarray(y)[same]).all(), name
+
+
+def test_context_and_rl_batch_come_from_one_episode_without_duplicates_in_the_context() -> None:
+    buffer = filled(n_episodes=12, relabel_probability=1.0)
+    data = buffer.sample(16, meta_batch_size=32, context_size=20)
+    context, rl = data.context.numpy(), np.concatenate([data.observations, data.actions, data.rewards[..., None]], axis=-1)
+    for row in range(32):
+        steps = {tuple(step) for step in context[row]}
+        assert len(steps) == 20
+        assert {tuple(step) for step in rl[row]} <= steps
+
+
+def test_ablation_draws_the_rl_batch_from_the_whole_task() -> None:
+    episode, task = (filled(n_episodes=24, relabel_probability=1.0, rl_batch_source=s) for s in ("episode", "task"))
+    zero = [(buffer.sample(16, meta_batch_size=200).rewards == 0).float().mean() for buffer in (episode, task)]
+    # B.2: the whole buffer under one episode's task is mostly unrewarded
+    assert zero[1] > zero[0] + 0.1
+
+
+def test_final_strategy_takes_the_last_state() -> None:
+    buffer = filled(relabel_probability=1.0, hindsight_task_strategy="final")
+    data = buffer.sample(4, meta_batch_size=16, context_size=20)
+    np.testing.assert_allclose(data.context[:, -1, -1], 1.0)  # at the goal itself the reward is 1 - 0
+
+
+def test_dense_proxy_is_only_in_the_rl_batch() -> None:
+    sparse, dense = (filled(relabel_probability=0.0, rl_reward_type=t) for t in ("sparse", "dense"))
+    a, b = sparse.sample(8), dense.sample(8)
+    assert (a.context == b.context).all()
+    distance = np.linalg.norm(b.next_observations - FAMILY.train_tasks[b.task_ids][:, None], axis=-1)
+    np.testing.assert_allclose(b.rewards, -distance, rtol=1e-5)
+
+
+def test_pickling_keeps_the_random_stream() -> None:
+    buffer = filled()
+    copy = pickle.loads(pickle.dumps(buffer))
+    assert_same(buffer.sample(4), copy.sample(4))
+
+
+def test_actions_reach_the_reward_hook_in_the_bounds_of_the_env() -> None:
+    from gymnasium import spaces
+
+    buffer = make_buffer(FAMILY)
+    buffer.action_space = spaces.Box(np.array([0.0, -3.0]), np.array([2.0, 5.0]), dtype=np.float64)
+    rows = np.zeros((3, buffer.episodes.rows.shape[1]), dtype=np.float32)
+    rows[:, 2:4] = [[-1, -1], [0, 0], [1, 1]]
+    np.testing.assert_allclose(buffer.trajectory(rows).actions, [[0, -3], [1, 1], [2, 5]])
+
+
+# --- bad input
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"relabel_probability": 1.5}, "relabel_probability is 1.5, expected a number from 0 to 1"),
+        ({"relabel_probability": float("nan")}, "relabel_probability is nan"),
+        ({"hindsight_task_strategy": "best"}, "expected one of .'final', 'random'."),
+        ({"rl_batch_source": "x"}, "rl_batch_source is 'x'"),
+        ({"rl_reward_type": "x"}, "rl_reward_type is 'x'"),
+        ({"context_episodes": 0}, "context_episodes is 0"),
+        ({"buffer_size": 100}, "too small for one episode"),
+        ({"optimize_memory_usage": True}, "optimize_memory_usage is not supported"),
+    ],
+)
+def test_bad_settings(kwargs: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_buffer(FAMILY, **kwargs)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"task_id": 80}, "task_id'. is 80, expected a training task from 0 to 79"),
+        ({"task_id": -1}, "only training tasks may enter the replay buffer"),
+        ({"reward": np.nan}, "The reward of task 7 .* is nan"),
+        ({"next_obs": np.inf}, "The next observation of task 7"),
+        ({"obs": np.nan}, "The observation of task 7"),
+    ],
+)
+def test_bad_steps(change: dict[str, float], message: str) -> None:
+    buffer = make_buffer(FAMILY, n_envs=1)
+    values = {"obs": 0.0, "next_obs": 0.0, "reward": 0.0, "task_id": 7, **change}
+    obs, next_obs = (np.full((1, 2), values[name], dtype=np.float32) for name in ("obs", "next_obs"))
+    info = {"task_id": values["task_id"], "task_free_reward": 0.0}
+    with pytest.raises(ValueError, match=message):
+        buffer.add(obs, next_obs, np.zeros((1, 2)), np.array([values["reward"]]), np.array([False]), [info])
+
+
+def test_a_task_that_changes_within_an_episode_and_an_episode_without_end() -> None:
+    buffer = make_buffer(FAMILY, n_envs=1)
+    step = np.zeros((1, 2), dtype=np.float32)
+
+    def add(task: int) -> None:
+        buffer.add(step, step, step, np.zeros(1), np.zeros(1, bool), [{"task_id": task, "task_free_reward": 0.0}])
+
+    add(1)
+    with pytest.raises(ValueError, match="changed from 1 to 2 within an episode"):
+        add(2)
+    for _ in range(19):
+        add(1)
+    with pytest.raises(ValueError, match="longer than the env's time limit of 20"):
+        add(1)
+
+
+def test_a_reward_hook_that_returns_nan_is_refused() -> None:
+    buffer = filled(relabel_probability=1.0)
+
+    class Broken(PointRobotFamily):
+        def _goal_reward(self, distance: Any) -> Any:
+            return distance * np.nan
+
+    buffer.task_family = Broken()
+    with pytest.raises(ValueError, match="compute_reward returned NaN or infinity"):
+        buffer.sample(4)
