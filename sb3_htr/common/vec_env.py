@@ -12,6 +12,10 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 
+# Attributes of a single task env, and where a batched one keeps those of all envs
+PER_ENV = {"task": "tasks", "task_id": "task_ids"}
+
+
 class BatchedTaskVecEnv(VecEnv):
     """
     Presents a natively batched gymnasium ``VectorEnv`` of a task family as SB3 ``VecEnv``.
@@ -66,7 +70,11 @@ class BatchedTaskVecEnv(VecEnv):
         self.vector_env.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        return [getattr(self.vector_env, attr_name)] * len(list(self._get_indices(indices)))
+        chosen = list(self._get_indices(indices))
+        if attr_name in PER_ENV:
+            values = getattr(self.vector_env, PER_ENV[attr_name])
+            return [values[i] for i in chosen]
+        return [getattr(self.vector_env, attr_name)] * len(chosen)
 
     def has_attr(self, attr_name: str) -> bool:
         return hasattr(self.vector_env, attr_name)

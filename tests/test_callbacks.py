@@ -1,0 +1,86 @@
+"""Evaluation during training, and files that are never half written."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ENV_ID
+
+from htr_envs import PointRobotFamily
+from sb3_htr import PEARL, evaluate_adaptation
+from sb3_htr.common.callbacks import MetaEvalCallback, MetaTrialEvalCallback
+from sb3_htr.common.checkpoint import CheckpointCallback, atomic_path
+from sb3_htr.common.vec_env import make_task_vec_env
+
+MakePEARL = Callable[..., PEARL]
+ROLLOUT = 4 * 3 * 20
+
+
+def test_meta_eval_logs_keeps_the_best_and_writes_npz(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    env = make_task_vec_env(ENV_ID, 20)
+    callback = MetaEvalCallback(
+        env, eval_freq=50, log_path=str(tmp_path), best_model_save_path=str(tmp_path), n_adaptation_episodes=3, verbose=0
+    )
+    model = tiny_pearl().learn(3 * ROLLOUT, callback=callback)
+    data = np.load(tmp_path / "evaluations.npz")
+    assert data["timesteps"].tolist() == [200, 400, 600]
+    assert data["returns"].shape == data["successes"].shape == (3, 20, 3)
+    np.testing.assert_array_equal(data["results"], data["returns"][:, :, -1])
+    assert callback.best_mean_reward == data["results"].mean(axis=1).max()
+    best = PEARL.load(tmp_path / "best_model")
+    returns, _ = evaluate_adaptation(best, env, PointRobotFamily().validation_tasks, n_episodes=3)
+    assert returns[:, -1].mean() == callback.best_mean_reward
+    assert model.num_timesteps == 3 * ROLLOUT
+
+
+def test_meta_eval_is_on_validation_tasks_unless_told(tmp_path: Path) -> None:
+    env, family = make_task_vec_env(ENV_ID, 2), PointRobotFamily()
+    assert (MetaEvalCallback(env).tasks == family.validation_tasks).all()
+    assert (MetaEvalCallback(env, tasks="test").tasks == family.test_tasks).all()
+    with pytest.raises(ValueError, match="tasks is 'tset'"):
+        MetaEvalCallback(env, tasks="tset")
+
+
+def test_a_trial_can_be_pruned(tiny_pearl: MakePEARL) -> None:
+    class Trial:
+        reported: list[tuple[float, int]] = []
+
+        def report(self, value: float, step: int) -> None:
+            self.reported.append((value, step))
+
+        def should_prune(self) -> bool:
+            return len(self.reported) == 2
+
+    trial = Trial()
+    callback = MetaTrialEvalCallback(make_task_vec_env(ENV_ID, 20), trial, eval_freq=20, n_adaptation_episodes=2)
+    model = tiny_pearl().learn(10 * ROLLOUT, callback=callback)
+    assert callback.is_pruned and model.num_timesteps == 2 * 20 * 4
+    assert [step for _, step in trial.reported] == [1, 2]
+
+
+def test_checkpoints_can_be_gone_on_from(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    model = tiny_pearl()
+    model.learn(5 * ROLLOUT, callback=CheckpointCallback(save_freq=60, save_path=str(tmp_path), keep=2))
+    kept = sorted((tmp_path / "checkpoints").iterdir(), key=lambda path: int(path.name.split("_")[0]))
+    assert [path.name for path in kept] == [f"{3 * ROLLOUT}_steps", f"{4 * ROLLOUT}_steps"]
+    loaded = PEARL.load(kept[-1] / "rl_model.zip", env=make_task_vec_env(ENV_ID, 4))
+    loaded.load_replay_buffer(kept[-1] / "replay_buffer.pkl")
+    assert loaded.replay_buffer is not None and loaded.replay_buffer.size() == 4 * ROLLOUT
+    loaded.learn(ROLLOUT, reset_num_timesteps=False)
+    assert loaded.num_timesteps == 5 * ROLLOUT
+
+
+def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
+    file = tmp_path / "new" / "file.txt"
+    with atomic_path(file) as path:
+        path.write_text("old")
+    with pytest.raises(KeyboardInterrupt), atomic_path(file) as path:
+        path.write_text("half")
+        raise KeyboardInterrupt
+    assert file.read_text() == "old"
+    assert list(file.parent.iterdir()) == [file]
+    with atomic_path(tmp_path / "new") as folder:
+        folder.mkdir()
+        (folder / "other").write_text("x")
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["other"]

@@ -1,0 +1,271 @@
+"""PEARL behaves as an SB3 algorithm: learn, callbacks, several envs, schedules, determinism, save and load."""
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from conftest import ENV_ID, TINY
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
+
+from sb3_htr import PEARL, evaluate_adaptation
+from sb3_htr.common.vec_env import make_task_vec_env
+
+MakePEARL = Callable[..., PEARL]
+ROLLOUT = 4 * 3 * 20  # env steps of one rollout of the tiny settings
+
+
+def parameters(model: PEARL) -> dict[str, th.Tensor]:
+    return {name: value.clone() for name, value in model.policy.state_dict().items()}
+
+
+class Counter(BaseCallback):
+    """Counts calls, and stops when told to."""
+
+    def __init__(self, stop_after: int = 10**9) -> None:
+        super().__init__()
+        self.calls, self.rollouts, self.stop_after = 0, 0, stop_after
+
+    def _on_step(self) -> bool:
+        self.calls += 1
+        assert {"infos", "dones", "rewards"} <= self.locals.keys()
+        return self.calls < self.stop_after
+
+    def _on_rollout_end(self) -> None:
+        self.rollouts += 1
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        {},
+        {"ent_coef": "auto"},
+        {"learning_rate": lambda remaining: 1e-3 * remaining},
+        {"target_update_interval": 2, "explorer": "prior", "train_explorer": "prior"},
+        {"replay_buffer_kwargs": {"relabel_probability": 0.0, "rl_reward_type": "dense"}},
+        {"replay_buffer_kwargs": {"relabel_probability": 1.0, "hindsight_task_strategy": "final"}},
+    ],
+)
+def test_learn_changes_every_network(tiny_pearl: MakePEARL, kwargs: dict[str, Any]) -> None:
+    model = tiny_pearl(**kwargs)
+    before = parameters(model)
+    model.learn(2 * ROLLOUT)
+    assert model.num_timesteps == 2 * ROLLOUT
+    assert model._n_updates == 2 * 3
+    after = parameters(model)
+    for network in ("actor.", "critic.", "critic_target.", "encoder.", "latent_prior."):
+        assert any(not th.equal(before[name], after[name]) for name in before if name.startswith(network)), network
+
+
+def test_critic_gradients_do_not_leak_into_the_encoder_from_the_actor(tiny_pearl: MakePEARL) -> None:
+    """The actor sees z detached: with the critics' and KL losses switched off, the encoder must not move."""
+    model = tiny_pearl(kl_coef=0.0)
+    model.learn(ROLLOUT)
+    model.critic.optimizer.param_groups[0]["lr"] = 0
+    model.lr_schedule = lambda _: 0.0  # type: ignore[assignment]
+    before = parameters(model)
+    for group in model.actor.optimizer.param_groups:
+        group["lr"] = 1e-2
+    model._update_learning_rate = lambda optimizers: None  # type: ignore[method-assign,assignment]
+    model.encoder.optimizer.param_groups[0]["lr"] = 1e-2
+    data = model.replay_buffer.sample(4)  # type: ignore[union-attr]
+    z = model.encoder(data.context, data.context_mask)[0].detach()
+    assert not z.requires_grad
+    model.train(1)
+    after = parameters(model)
+    assert all(th.equal(before[n], after[n]) for n in before if n.startswith("critic."))
+    assert any(not th.equal(before[n], after[n]) for n in before if n.startswith("actor."))
+    assert all(p.grad is not None and p.requires_grad for p in model.critic.parameters())
+
+
+@pytest.mark.parametrize("n_envs", [1, 3, 5])
+def test_any_number_of_envs(tiny_pearl: MakePEARL, n_envs: int) -> None:
+    """4 tasks on n envs take ceil(4 / n) rounds of 3 episodes each."""
+    for env in (make_task_vec_env(ENV_ID, n_envs), make_vec_env(ENV_ID, n_envs)):
+        model = tiny_pearl(env)
+        model.learn(1)
+        assert model.num_timesteps == -(-4 // n_envs) * n_envs * 3 * 20
+        assert model.replay_buffer is not None and model.replay_buffer.size() == model.num_timesteps
+
+
+def test_envs_in_processes(tiny_pearl: MakePEARL) -> None:
+    env = make_vec_env(f"htr_envs:{ENV_ID}", 2, vec_env_cls=SubprocVecEnv)
+    try:
+        tiny_pearl(env).learn(1)
+    finally:
+        env.close()
+
+
+def test_a_single_env_a_batch_and_an_id_are_the_same_to_pearl(tiny_pearl: MakePEARL) -> None:
+    runs = [
+        parameters(tiny_pearl(env, n_tasks_per_rollout=1).learn(2 * ROLLOUT))
+        for env in (gym.make(ENV_ID), make_task_vec_env(ENV_ID, 1), ENV_ID)
+    ]
+    for run in runs[1:]:
+        assert all(th.equal(run[name], runs[0][name]) for name in run)
+
+
+def test_callbacks_see_every_step_and_can_stop(tiny_pearl: MakePEARL) -> None:
+    counter = Counter()
+    tiny_pearl().learn(2 * ROLLOUT, callback=counter)
+    assert counter.calls == 2 * ROLLOUT / 4 and counter.rollouts == 2
+    counter = Counter(stop_after=7)
+    model = tiny_pearl().learn(10 * ROLLOUT, callback=counter)
+    assert counter.calls == 7 and model.num_timesteps == 28
+
+
+def test_usual_arguments_of_learn(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    model = tiny_pearl(tensorboard_log=str(tmp_path))
+    model.learn(ROLLOUT, tb_log_name="name", log_interval=1, progress_bar=True)
+    model.learn(ROLLOUT, reset_num_timesteps=False, log_interval=None, tb_log_name="name")
+    assert model.num_timesteps == 2 * ROLLOUT
+    assert list(tmp_path.glob("name_1/events*"))
+    model.learn(ROLLOUT)
+    assert model.num_timesteps == ROLLOUT
+
+
+def test_logs(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl().learn(2 * ROLLOUT, log_interval=None)
+    values = model.logger.name_to_value
+    assert 0 <= values["train/relabelled_fraction"] <= 1
+    assert values["train/kl_divergence"] > 0 and values["train/n_updates"] == 6
+    assert np.isfinite([v for k, v in values.items() if k.startswith("train/")]).all()
+
+
+def test_the_same_seed_gives_the_same_bits(tiny_pearl: MakePEARL) -> None:
+    runs = [parameters(tiny_pearl(seed=3).learn(2 * ROLLOUT)) for _ in range(2)]
+    other = parameters(tiny_pearl(seed=4).learn(2 * ROLLOUT))
+    assert all(th.equal(runs[0][name], runs[1][name]) for name in runs[0])
+    assert not all(th.equal(runs[0][name], other[name]) for name in other)
+
+
+def test_set_random_seed_makes_what_follows_repeatable(tiny_pearl: MakePEARL) -> None:
+    results = []
+    for start in (0, 1):
+        model = tiny_pearl(seed=start)
+        model.policy.load_state_dict(tiny_pearl(seed=9).policy.state_dict())
+        model.set_random_seed(5)
+        results.append(parameters(model.learn(ROLLOUT)))
+    assert all(th.equal(results[0][name], results[1][name]) for name in results[0])
+
+
+def test_evaluation_leaves_training_alone(tiny_pearl: MakePEARL) -> None:
+    """Evaluations in between must not change what is learnt."""
+
+    class Evaluate(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.n_calls % 37 == 0:
+                evaluate_adaptation(self.model, ENV_ID, np.eye(2, dtype=np.float32), n_episodes=2)  # type: ignore[arg-type]
+            return True
+
+    plain, evaluated = tiny_pearl().learn(2 * ROLLOUT), tiny_pearl().learn(2 * ROLLOUT, callback=Evaluate())
+    for a, b in zip(parameters(plain).values(), parameters(evaluated).values(), strict=True):
+        assert th.equal(a, b)
+
+
+# --- save and load
+
+
+def test_save_and_load(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    model = tiny_pearl().learn(2 * ROLLOUT)
+    model.save(tmp_path / "model")
+    obs, z = np.random.default_rng(0).normal(size=(7, 2)).astype(np.float32), np.ones((7, 3), dtype=np.float32)
+    expected, _ = model.predict(obs, state=(z,), deterministic=True)
+    for env in (None, make_task_vec_env(ENV_ID, 2)):
+        loaded = PEARL.load(tmp_path / "model", env=env)
+        actions, _ = loaded.predict(obs, state=(z,), deterministic=True)
+        np.testing.assert_array_equal(actions, expected)
+        for (name, a), b in zip(parameters(model).items(), parameters(loaded).values(), strict=True):
+            assert th.equal(a, b), name
+        for optimizer in ("actor", "critic", "encoder"):
+            a, b = (getattr(m, optimizer).optimizer.state_dict()["state"] for m in (model, loaded))
+            assert a.keys() == b.keys() and len(a) > 0
+            assert all(th.equal(a[key]["exp_avg"], b[key]["exp_avg"]) for key in a), optimizer
+        # The same evaluation too: what is known about z is saved
+        for x, y in zip(evaluate_adaptation(model, ENV_ID, n_episodes=3), evaluate_adaptation(loaded, ENV_ID, n_episodes=3)):
+            np.testing.assert_array_equal(x, y)
+    loaded.learn(ROLLOUT, reset_num_timesteps=False)
+    assert loaded.num_timesteps == 3 * ROLLOUT
+
+
+def test_loading_for_prediction_stores_nothing_and_an_env_can_come_later(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    tiny_pearl().learn(ROLLOUT).save(tmp_path / "model.zip")
+    loaded = PEARL.load(tmp_path / "model.zip")
+    assert loaded.replay_buffer is None
+    loaded.set_env(make_task_vec_env(ENV_ID, 4))
+    loaded.learn(ROLLOUT)
+
+
+def test_the_policy_can_be_saved_alone(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    model = tiny_pearl().learn(ROLLOUT)
+    model.policy.save(tmp_path / "policy")
+    policy = type(model.policy).load(tmp_path / "policy")
+    obs, z = np.ones((1, 2), dtype=np.float32), np.ones((1, 3), dtype=np.float32)
+    np.testing.assert_array_equal(policy.predict(obs, (z,), deterministic=True)[0], model.predict(obs, (z,), None, True)[0])
+
+
+def test_the_replay_buffer_is_saved_with_what_was_learnt_of_it(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    model = tiny_pearl().learn(2 * ROLLOUT)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = PEARL.load(tmp_path / "model", env=make_task_vec_env(ENV_ID, 4))
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    assert model.replay_buffer is not None and loaded.replay_buffer is not None
+    assert loaded.replay_buffer.size() == model.replay_buffer.size() > 0
+    assert model.task_bank is not None and loaded.task_bank is not None
+    np.testing.assert_array_equal(loaded.task_bank.best_return, model.task_bank.best_return)
+    a, b = model.replay_buffer.sample(4), loaded.replay_buffer.sample(4)
+    assert all((np.asarray(x) == np.asarray(y)).all() for x, y in zip(a, b, strict=True))
+
+
+# --- prediction
+
+
+def test_predict_takes_and_returns_z(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    obs = np.zeros((5, 2), dtype=np.float32)
+    z = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        actions, state = model.predict(obs, state=(z,), deterministic=True)
+    assert actions.shape == (5, 2) and state is not None and (state[0] == z).all()
+    assert len(np.unique(actions, axis=0)) == 5, "actions must depend on z"
+    assert model.predict(obs[0], state=(z[:1],), deterministic=True)[0].shape == (2,)
+
+
+def test_an_agent_that_is_not_adapted_warns_once(tiny_pearl: MakePEARL) -> None:
+    model, env = tiny_pearl(), make_vec_env(ENV_ID)
+    with pytest.warns(UserWarning, match="not adapted to any task"):
+        evaluate_policy(model, env, n_eval_episodes=2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        evaluate_policy(model, env, n_eval_episodes=1)
+
+
+def test_normalized_observations(tiny_pearl: MakePEARL) -> None:
+    env = VecNormalize(make_task_vec_env(ENV_ID, 4), norm_reward=False)
+    model = tiny_pearl(env).learn(2 * ROLLOUT)
+    assert model.replay_buffer is not None
+    data = model.replay_buffer.sample(64, env=env)
+    raw = model.replay_buffer.sample(64)
+    assert abs(data.observations.std() - 1) < 0.5 < abs(raw.observations.std() - 1)
+
+
+def test_every_argument_is_documented() -> None:
+    import inspect
+
+    for name in inspect.signature(PEARL.__init__).parameters:
+        assert name == "self" or f":param {name}:" in (PEARL.__doc__ or ""), name
+
+
+def test_tiny_settings_are_real_arguments() -> None:
+    import inspect
+
+    assert TINY.keys() <= inspect.signature(PEARL.__init__).parameters.keys()

@@ -1,0 +1,107 @@
+"""The commands, as a user would call them."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from conftest import ENV_ID, TINY
+
+from sb3_htr import PEARL
+from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.zoo.cli import main
+from sb3_htr.zoo.hyperparams import hyperparams_file
+
+SMALL = [
+    "n_tasks_per_rollout:4",
+    "n_episodes_per_task:3",
+    "learning_starts:240",
+    "gradient_steps:2",
+    "n_envs:4",
+    "policy_kwargs:{'net_arch':[16],'encoder_arch':[16]}",
+]
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs")
+    arguments = ["train", "--env", ENV_ID, "-f", str(folder), "-n", "960", "--eval-freq", "480", "--save-freq", "480"]
+    assert main([*arguments, "--seed", "1", "--verbose", "0", "-tb", str(folder / "tb"), "-params", *SMALL]) == 0
+    return folder
+
+
+def test_train_writes_a_run_folder(runs: Path) -> None:
+    run = runs / "pearl" / f"{ENV_ID}_1"
+    settings = json.loads((run / "run.json").read_text())
+    assert settings["env_id"] == ENV_ID and settings["seed"] == 1 and "torch" in settings["versions"]
+    assert settings["hyperparams"]["n_tasks_per_rollout"] == 4
+    assert (run / ENV_ID / "config.yml").exists() and list(runs.glob("tb/**/events*"))
+    assert np.load(run / "evaluations.npz")["timesteps"].tolist() == [480, 960]
+    assert len((run / "0.monitor.csv").read_text().splitlines()) == 2 + 960 / 20
+    assert PEARL.load(run / f"{ENV_ID}.zip").num_timesteps == 960
+    assert (run / "best_model.zip").exists() and list((run / "checkpoints").iterdir())
+
+
+@pytest.mark.parametrize("arguments", [[], ["--model", "last", "--tasks", "validation", "--explorer", "prior"]])
+def test_evaluate_prints_a_table_and_draws_pictures(runs: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", str(runs), "--n-episodes", "6", *arguments]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert sum(line.strip().startswith(tuple("123456")) for line in lines) == 6
+    run = runs / "pearl" / f"{ENV_ID}_1"
+    record = np.load(run / "adaptation.npz")
+    assert record["returns"].shape == (20, 6) and record["achieved"].shape == (20, 6, 20, 2)
+    for picture in ("adaptation_curve.png", "adaptation_paths.png"):
+        assert (run / picture).read_bytes().startswith(b"\x89PNG")
+        assert (run / picture).stat().st_size > 10_000
+
+
+def test_a_run_goes_on_from_a_checkpoint(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    checkpoint = next((runs / "pearl" / f"{ENV_ID}_1" / "checkpoints").iterdir()) / "rl_model.zip"
+    arguments = ["train", "--env", ENV_ID, "-f", str(runs / "more"), "-n", "240", "-i", str(checkpoint), "--eval-freq", "-1"]
+    assert main([*arguments, "--verbose", "0", "-params", *SMALL]) == 0
+    assert "Loading replay buffer" in capsys.readouterr().out
+
+
+def test_env_kwargs_of_the_yaml_reach_the_evaluation(tmp_path: Path) -> None:
+    """A zoo trap: rl_zoo3 gives them to the training env only."""
+    block = {**{k: v for k, v in TINY.items() if k != "seed"}, "policy": "MlpPolicy", "n_timesteps": 240, "n_envs": 4}
+    file = tmp_path / "my.yml"
+    file.write_text(yaml.safe_dump({ENV_ID: {**block, "env_kwargs": {"goal_distance": 0.05}}}))
+    arguments = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(file), "--eval-freq", "240", "--verbose", "0"]
+    assert main(arguments) == 0
+    # Every goal disc of this distance holds the start, so that all adaptations find it at once
+    evaluations = np.load(tmp_path / "pearl" / f"{ENV_ID}_1" / "evaluations.npz")
+    assert evaluations["successes"].all(axis=(0, 1))[0]
+
+
+def test_help_and_mistakes(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["--help"]) == 0 and "evaluate" in capsys.readouterr().out
+    assert main(["trian"]) == 2 and "usage: sb3-htr" in capsys.readouterr().err
+    with pytest.raises(FileNotFoundError, match="There is no run in"):
+        main(["evaluate", str(tmp_path)])
+
+
+def blocks() -> list[tuple[str, str]]:
+    files = sorted(hyperparams_file().parent.glob("*.yml"))
+    return [(file.name, key) for file in files for key in yaml.safe_load(file.read_text())]
+
+
+@pytest.mark.parametrize(("file", "block"), blocks())
+def test_every_block_of_hyperparameters_trains(file: str, block: str) -> None:
+    settings = yaml.safe_load(hyperparams_file(file).read_text())[block]
+    n_envs = settings.pop("n_envs")
+    del settings["n_timesteps"]
+    env = make_task_vec_env(ENV_ID if block == "default" else block, n_envs)
+    # The settings as they are, but a short rollout and two updates
+    model = PEARL(env=env, seed=0, **{**settings, "learning_starts": 0, "gradient_steps": 2, "n_episodes_per_task": 1})
+    model.learn(1)
+    assert model._n_updates == 2
+
+
+def test_importing_the_library_is_light() -> None:
+    """rl_zoo3 would replace gymnasium's TimeLimit for the whole process."""
+    code = "import sys, sb3_htr; print([m for m in ('rl_zoo3', 'htr_envs', 'optuna') if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
