@@ -75,7 +75,8 @@ def add_episode(
         reward = family.compute_reward(traj, family.train_tasks[tasks])[:, 0]
         done = np.full(n, step == length - 1)
         infos: list[dict[str, Any]] = [
-            {"task_id": task, "task_free_reward": 0.0, "TimeLimit.truncated": bool(done[0]) and not terminated} for task in tasks
+            {"task_id": task, "task_free_reward": 0.0, "TimeLimit.truncated": bool(done[0]) and not terminated}
+            for task in tasks
         ]
         buffer.add(obs, next_obs, action, reward, done, infos)
         obs = next_obs

@@ -100,7 +100,8 @@ def test_adapt_gives_an_agent_for_the_task_of_the_env(tiny_pearl: MakePEARL) -> 
     agent = model.adapt(env, n_episodes=3)
     assert agent.returns.shape == (3,) and agent.successes.all()
     mean, _ = evaluate_policy(agent, env, n_eval_episodes=2, warn=False)
-    assert mean > 0 and env.unwrapped.task_id == -1  # type: ignore[attr-defined]
+    assert isinstance(mean, float) and mean > 0
+    assert env.unwrapped.task_id == -1  # type: ignore[attr-defined]
     obs, _ = env.reset()
     action, state = agent.predict(obs, deterministic=True)
     assert action.shape == (2,) and state is None
@@ -169,7 +170,7 @@ def test_search_settles_on_the_best_episode_after_setbacks(tiny_pearl: MakePEARL
     policy = tiny_pearl().policy
     policy.latent_prior.set_plan(th.randn(4, 3))
     adaptation = Adaptation(policy, 1, Explorer.SEARCH, 0, th.Generator().manual_seed(0))
-    z = play(adaptation, [[0], [5], *[[1]] * MAX_SETBACKS, [5], [5]])
+    z = play(adaptation, [[0.0], [5.0], *[[1.0] for _ in range(MAX_SETBACKS)], [5.0], [5.0]])
     for episode in range(2, 2 + MAX_SETBACKS):
         assert (z[episode] != z[1]).any()
     for settled in z[2 + MAX_SETBACKS :]:

@@ -89,7 +89,7 @@ def test_rewards_that_become_nan_stop_training(tiny_pearl: MakePEARL) -> None:
         def reward(self, reward: Any) -> Any:
             return float("nan")
 
-    with pytest.raises(ValueError, match="The reward of task .* is nan, expected finite numbers"):
+    with pytest.raises(ValueError, match=r"The reward of task .* is nan, expected finite numbers"):
         tiny_pearl(Broken(gym.make(ENV_ID))).learn(1)
 
 
@@ -102,5 +102,5 @@ def test_options_of_a_batch_must_agree() -> None:
 
 def test_only_same_step_autoreset_can_be_an_sb3_vec_env() -> None:
     env = gym.make_vec(ENV_ID, 2, vectorization_mode="sync")
-    with pytest.raises(ValueError, match="expected AutoresetMode.SAME_STEP"):
+    with pytest.raises(ValueError, match=r"expected AutoresetMode\.SAME_STEP"):
         BatchedTaskVecEnv(env)

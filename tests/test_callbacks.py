@@ -44,7 +44,8 @@ def test_meta_eval_is_on_validation_tasks_unless_told(tmp_path: Path) -> None:
 
 def test_a_trial_can_be_pruned(tiny_pearl: MakePEARL) -> None:
     class Trial:
-        reported: list[tuple[float, int]] = []
+        def __init__(self) -> None:
+            self.reported: list[tuple[float, int]] = []
 
         def report(self, value: float, step: int) -> None:
             self.reported.append((value, step))

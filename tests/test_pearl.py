@@ -69,11 +69,11 @@ def test_critic_gradients_do_not_leak_into_the_encoder_from_the_actor(tiny_pearl
     model = tiny_pearl(kl_coef=0.0)
     model.learn(ROLLOUT)
     model.critic.optimizer.param_groups[0]["lr"] = 0
-    model.lr_schedule = lambda _: 0.0  # type: ignore[assignment]
+    model.lr_schedule = lambda _: 0.0
     before = parameters(model)
     for group in model.actor.optimizer.param_groups:
         group["lr"] = 1e-2
-    model._update_learning_rate = lambda optimizers: None  # type: ignore[method-assign,assignment]
+    model._update_learning_rate = lambda optimizers: None  # type: ignore[method-assign]
     model.encoder.optimizer.param_groups[0]["lr"] = 1e-2
     data = model.replay_buffer.sample(4)  # type: ignore[union-attr]
     z = model.encoder(data.context, data.context_mask)[0].detach()
@@ -189,7 +189,8 @@ def test_save_and_load(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
             assert a.keys() == b.keys() and len(a) > 0
             assert all(th.equal(a[key]["exp_avg"], b[key]["exp_avg"]) for key in a), optimizer
         # The same evaluation too: what is known about z is saved
-        for x, y in zip(evaluate_adaptation(model, ENV_ID, n_episodes=3), evaluate_adaptation(loaded, ENV_ID, n_episodes=3)):
+        evaluations = [evaluate_adaptation(m, ENV_ID, n_episodes=3) for m in (model, loaded)]
+        for x, y in zip(*evaluations, strict=True):
             np.testing.assert_array_equal(x, y)
     loaded.learn(ROLLOUT, reset_num_timesteps=False)
     assert loaded.num_timesteps == 3 * ROLLOUT
@@ -205,8 +206,8 @@ def test_loading_for_prediction_stores_nothing_and_an_env_can_come_later(tiny_pe
 
 def test_the_policy_can_be_saved_alone(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
     model = tiny_pearl().learn(ROLLOUT)
-    model.policy.save(tmp_path / "policy")
-    policy = type(model.policy).load(tmp_path / "policy")
+    model.policy.save(str(tmp_path / "policy"))
+    policy = type(model.policy).load(str(tmp_path / "policy"))
     obs, z = np.ones((1, 2), dtype=np.float32), np.ones((1, 3), dtype=np.float32)
     np.testing.assert_array_equal(policy.predict(obs, (z,), deterministic=True)[0], model.predict(obs, (z,), None, True)[0])
 

@@ -9,15 +9,15 @@ from conftest import add_episode, make_buffer
 from hypothesis import given
 from hypothesis import strategies as st
 
-from htr_envs import PointRobotFamily
+from htr_envs import PointRobotFamily, Trajectory
 from sb3_htr.common.type_aliases import MultiTaskSamples
 from sb3_htr.htr.episode_store import EpisodeStore
-from sb3_htr.htr.multi_task_replay_buffer import spread
+from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer, spread
 
 FAMILY = PointRobotFamily()
 
 
-def filled(walk_seed: int = 0, n_episodes: int = 6, lengths: tuple[int, ...] = (20,), **kwargs: Any):  # type: ignore[no-untyped-def]
+def filled(walk_seed: int = 0, n_episodes: int = 6, lengths: tuple[int, ...] = (20,), **kwargs: Any) -> MultiTaskReplayBuffer:
     rng = np.random.default_rng(walk_seed)
     buffer = make_buffer(FAMILY, **kwargs)
     for i in range(n_episodes):
@@ -127,15 +127,13 @@ def test_every_reward_is_that_of_one_task_per_row(seed: int, lengths: tuple[int,
         assert (candidates == reward[row]).all(axis=1).any(), "no reached state gives these rewards"
 
 
-def _context_traj(data: MultiTaskSamples):  # type: ignore[no-untyped-def]
-    from htr_envs import Trajectory
-
+def _context_traj(data: MultiTaskSamples) -> Trajectory:
     context = data.context.numpy()
     obs, action = context[..., :2], context[..., 2:4]
     return Trajectory(obs, action, (obs + 0.1 * action).astype(np.float32), np.zeros(obs.shape[:2], dtype=np.float32))
 
 
-def _rows(traj: Any, row: int) -> Any:
+def _rows(traj: Any, row: Any) -> Any:
     return type(traj)(*(x[row][None] for x in traj))
 
 

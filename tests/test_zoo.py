@@ -46,7 +46,9 @@ def test_train_writes_a_run_folder(runs: Path) -> None:
 
 
 @pytest.mark.parametrize("arguments", [[], ["--model", "last", "--tasks", "validation", "--explorer", "prior"]])
-def test_evaluate_prints_a_table_and_draws_pictures(runs: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_evaluate_prints_a_table_and_draws_pictures(
+    runs: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["evaluate", str(runs), "--n-episodes", "6", *arguments]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert sum(line.strip().startswith(tuple("123456")) for line in lines) == 6

@@ -11,7 +11,6 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-
 # Attributes of a single task env, and where a batched one keeps those of all envs
 PER_ENV = {"task": "tasks", "task_id": "task_ids"}
 

@@ -1,7 +1,5 @@
 """What :meth:`sb3_htr.PEARL.adapt` returns."""
 
-from typing import Any
-
 import numpy as np
 
 from sb3_htr.pearl.policies import PEARLPolicy
@@ -25,11 +23,11 @@ class AdaptedAgent:
 
     def predict(
         self,
-        observation: np.ndarray,
+        observation: np.ndarray | dict[str, np.ndarray],
         state: tuple[np.ndarray, ...] | None = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
-    ) -> tuple[Any, tuple[np.ndarray, ...] | None]:
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """
         :param observation: (obs_dim,) or (n, obs_dim)
         :param state: ignored, the agent has no memory

@@ -440,9 +440,9 @@ class PEARL(SAC):
             )
         return AdaptedAgent(self.policy, adaptation.z[0].copy(), record.returns[0], record.successes[0])
 
-    def predict(  # type: ignore[override]
+    def predict(
         self,
-        observation: np.ndarray,
+        observation: np.ndarray | dict[str, np.ndarray],
         state: tuple[np.ndarray, ...] | None = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,

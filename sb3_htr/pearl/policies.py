@@ -160,13 +160,13 @@ class PEARLPolicy(SACPolicy):
             **{key: data[key] for key in keys},
         )
 
-    def predict(  # type: ignore[override]
+    def predict(
         self,
-        observation: np.ndarray,
+        observation: np.ndarray | dict[str, np.ndarray],
         state: tuple[np.ndarray, ...] | None = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """
         :param observation: (obs_dim,) or (n, obs_dim)
         :param state: tuple of one array, z of each observation (n, latent_dim); None is the prior mean

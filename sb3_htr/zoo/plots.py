@@ -70,7 +70,9 @@ def plot_adaptation_paths(
     order = np.argsort(np.arctan2(tasks[:, 1], tasks[:, 0]))[shown]
     columns = min(3, len(order))
     rows = -(-len(order) // columns)
-    figure, grid = plt.subplots(rows, columns, figsize=(3.1 * columns, 2.9 * rows), squeeze=False, sharex=True, sharey=True)
+    figure, grid = plt.subplots(
+        rows, columns, figsize=(3.1 * columns, 2.4 * rows + 0.4), squeeze=False, sharex=True, sharey=True, layout="constrained"
+    )
     for axes in grid.flat[len(order) :]:
         axes.set_visible(False)
     for axes, task in zip(grid.flat, order, strict=False):
@@ -93,8 +95,7 @@ def plot_adaptation_paths(
         plt.Line2D([], [], color=ORANGE, linewidth=2, label="last episode"),
         plt.Line2D([], [], color=GREEN, marker="o", linestyle="", alpha=0.5, markersize=9, label="hidden goal"),
     ]
-    figure.legend(handles=handles, loc="lower center", ncols=4, frameon=False)
-    figure.supxlabel("x", y=0.07)
-    figure.supylabel("y")
-    figure.tight_layout(rect=(0, 0.06, 1, 1))
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
+    figure.supxlabel("x", fontsize=10)
+    figure.supylabel("y", fontsize=10)
     _save(figure, path)
