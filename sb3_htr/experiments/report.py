@@ -2,7 +2,6 @@
 
 import json
 import platform
-import subprocess
 import sys
 from collections.abc import Callable
 from datetime import date
@@ -31,8 +30,9 @@ def iqm_interval(scores: np.ndarray, reps: int = 2000) -> tuple[float, float, fl
     :param reps: bootstrap samples
     :return: interquartile mean over runs, and its 95 % stratified bootstrap interval
     """
+    np.random.seed(0)  # rliable hands its random_state on to a library that has come to ignore it
     estimates, intervals = library.get_interval_estimates(
-        {"": scores[:, None]}, lambda x: np.array([metrics.aggregate_iqm(x)]), reps=reps, random_state=np.random.RandomState(0)
+        {"": scores[:, None]}, lambda x: np.array([metrics.aggregate_iqm(x)]), reps=reps
     )
     return float(estimates[""][0]), float(intervals[""][0, 0]), float(intervals[""][1, 0])
 
@@ -83,11 +83,11 @@ def summarize(name: str, results: dict[Cell, Path]) -> dict[str, Any]:
                         "wall_s": round(float(np.mean([r["wall_s"] for r in raw])), 1),
                     }
                 )
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=RESULTS.parent).stdout
+    commits = sorted({str(np.load(path)["commit"]) for path in results.values()})
     return {
         "name": name,
         "command": " ".join(["python", "-m", f"sb3_htr.experiments.{name}", *sys.argv[1:]]),
-        "commit": commit.strip(),
+        "commit": ", ".join(commits),
         "date": date.today().isoformat(),
         "machine": f"{_processor()}, one thread per run, Python {platform.python_version()}",
         "rows": rows,
@@ -130,7 +130,7 @@ def plot(results: dict[Cell, Path], path: Path) -> None:
     groups: dict[str, list[Any]] = {}
     for cell, result in results.items():
         groups.setdefault(cell.method, []).append((cell, np.load(result)))
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.8), layout="constrained")
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
     for colour, (method, runs) in zip(COLOURS, groups.items(), strict=False):
         curve = np.stack([raw["curve"].mean(axis=1) for _, raw in runs])
         _band(left, runs[0][1]["timesteps"] / 1000, curve, colour, "-", method)
@@ -142,11 +142,12 @@ def plot(results: dict[Cell, Path], path: Path) -> None:
     left.set_title("validation tasks, during meta-training", fontsize=10)
     right.set_xlabel("adaptation episode")
     right.set_ylabel("return")
+    right.xaxis.get_major_locator().set_params(integer=True)
     right.set_title("test tasks, final models", fontsize=10)
     for axes in (left, right):
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.25)
-        axes.legend(frameon=False, fontsize=8)
+        axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=2)
     figure.suptitle(
         f"{next(iter(results)).env_id}: IQM over {len(next(iter(groups.values())))} seeds, 95 % interval", fontsize=11
     )

@@ -71,7 +71,8 @@ def run_cell(cell: Cell, folder: Path, eval_freq: int) -> Path:
     :param folder: where all cells' folders are; a cell that has a result there is not run again
     :param eval_freq: env steps between evaluations
     :return: npz with ``timesteps``, ``curve`` (n, n_tasks) on validation tasks, and for each explorer
-        ``returns_<explorer>`` and ``successes_<explorer>`` (n_tasks, n_episodes) on test tasks
+        ``returns_<explorer>`` and ``successes_<explorer>`` (n_tasks, n_episodes) on test tasks; ``wall_s`` of the training
+        and ``commit`` of the code
     """
     result = folder / f"{cell.name}.npz"
     if result.exists():
@@ -85,7 +86,12 @@ def run_cell(cell: Cell, folder: Path, eval_freq: int) -> Path:
     run = find_run(folder / cell.name)
     model = PEARL.load(run / f"{cell.env_id}.zip", device="cpu")
     evaluations = np.load(run / "evaluations.npz")
-    arrays: dict[str, Any] = {"timesteps": evaluations["timesteps"], "curve": evaluations["results"], "wall_s": wall}
+    arrays: dict[str, Any] = {
+        "timesteps": evaluations["timesteps"],
+        "curve": evaluations["results"],
+        "wall_s": wall,
+        "commit": _commit(),
+    }
     env = make_task_vec_env(cell.env_id, 20, env_kwargs=cell.env_kwargs)
     for explorer in cell.explorers:
         returns, successes = evaluate_adaptation(model, env, explorer=explorer)
@@ -94,6 +100,12 @@ def run_cell(cell: Cell, folder: Path, eval_freq: int) -> Path:
         np.savez_compressed(path, **arrays)
     print(f"{cell.name}: {json.dumps({e: round(float(arrays[f'returns_{e}'][:, -1].mean()), 2) for e in cell.explorers})}")
     return result
+
+
+def _commit() -> str:
+    """Of the code that runs, empty outside a checkout."""
+    command = ["git", "rev-parse", "--short", "HEAD"]
+    return subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parent).stdout.strip()
 
 
 def run_cells(cells: list[Cell], folder: Path, jobs: int, eval_freq: int = 10_000) -> dict[Cell, Path]:
