@@ -5,7 +5,7 @@ from gymnasium.envs.registration import register
 from htr_envs.check_task_env import check_task_env
 from htr_envs.point_robot import PointRobotEnv, PointRobotFamily, PointRobotVectorEnv
 from htr_envs.semicircle_goals import SemicircleGoalFamily
-from htr_envs.task_env import TaskEnv, TaskFamily, Trajectory
+from htr_envs.task_env import TaskEnv, TaskFamily, Trajectory, at_step, check_reward_type
 from htr_envs.task_vector_env import TaskVectorEnv
 
 __all__ = [
@@ -17,6 +17,8 @@ __all__ = [
     "TaskFamily",
     "TaskVectorEnv",
     "Trajectory",
+    "at_step",
+    "check_reward_type",
     "check_task_env",
 ]
 

@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, check_reward_type
+from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, at_step, check_reward_type
 
 
 class SemicircleGoalFamily(TaskFamily):
@@ -115,8 +115,4 @@ class SemicircleGoalFamily(TaskFamily):
         :param index: which step, an int or an int array that broadcasts with the leading axes of ``traj``.
         :return: goals, shape (..., 2), float32, sharing no memory with ``traj``.
         """
-        positions = np.asarray(traj.next_observations, dtype=np.float32)[..., :2]
-        leading = np.broadcast_shapes(np.shape(index), positions.shape[:-2])
-        positions = np.broadcast_to(positions, leading + positions.shape[-2:])
-        indices = np.broadcast_to(np.asarray(index), leading)[..., None, None]
-        return np.take_along_axis(positions, indices, axis=-2)[..., 0, :]
+        return at_step(traj.next_observations[..., :2], index)

@@ -50,6 +50,20 @@ def check_reward_type(reward_type: str) -> None:
         raise ValueError(f"reward_type is {reward_type!r}, but only 'sparse' and 'dense' exist: pass one of these two.")
 
 
+def at_step(values: FloatArray, index: ArrayLike) -> FloatArray:
+    """Pick one step of each trajectory; what a ``hindsight_task`` needs.
+
+    :param values: one row per step, shape (..., T, dim).
+    :param index: which step, an int or an int array that broadcasts with the leading axes of ``values``.
+    :return: the rows, shape (..., dim), float32, sharing no memory with ``values``.
+    """
+    values = np.asarray(values, dtype=np.float32)
+    leading = np.broadcast_shapes(np.shape(index), values.shape[:-2])
+    values = np.broadcast_to(values, leading + values.shape[-2:])
+    indices = np.broadcast_to(np.asarray(index), leading)[..., None, None]
+    return np.take_along_axis(values, indices, axis=-2)[..., 0, :]
+
+
 class TaskFamily(ABC):
     """A distribution of tasks with their rewards: small, picklable, stateless.
 
