@@ -127,8 +127,8 @@ class TaskFamily(ABC):
 
         :param traj: the steps, arrays of shape (..., T, dim).
         :param task: the task, shape (..., task_dim); its leading axes broadcast with those of ``traj``.
-        :param reward_type: ``"sparse"`` is the true reward; its task part is one constant wherever the step is no success, so
-            that nothing about the task leaks. ``"dense"`` is the proxy reward of the oracle baseline.
+        :param reward_type: ``"sparse"`` is the true reward; its task part is positive where a step is a success and 0 where
+            it is none, so that nothing about the task leaks. ``"dense"`` is the proxy reward of the oracle baseline.
         :return: rewards, shape (..., T), float32.
         :raises ValueError: if the reward type is unknown.
         """

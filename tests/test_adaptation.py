@@ -225,3 +225,12 @@ def test_search_plan_finds_every_task_that_was_ever_reached(tiny_pearl: MakePEAR
     assert first.max() < 32 and first.mean() < 6
     # A visit never goes first where another task would reveal more
     assert found[0].sum() > len(solved) / 5
+
+
+def test_the_frozen_agent_acts_with_what_is_known_to_work(tiny_pearl: MakePEARL) -> None:
+    policy = tiny_pearl().policy
+    policy.latent_prior.set_plan(th.randn(4, 3))
+    adaptation = Adaptation(policy, 2, Explorer.SEARCH, 0, th.Generator().manual_seed(0))
+    z = play(adaptation, [[0.0, 0.0], [5.0, 0.0], [1.0, 2.0]])
+    np.testing.assert_array_equal(adaptation.frozen_z()[0], z[1][0])  # its posterior was worse
+    np.testing.assert_array_equal(adaptation.frozen_z()[1], adaptation.z[1])  # its posterior is not tried yet

@@ -423,7 +423,13 @@ class HindsightView(LineFamily):
         return traj.next_observations[index, :1] if np.ndim(index) == 0 else super().hindsight_task(traj, index)
 
 
-@breaks("The sparse reward of an unsuccessful step depends on the task")
+@breaks("The sparse reward of an unsuccessful step is not 0")
+class PunishedFailure(LineFamily):
+    def compute_reward(self, traj: Any, task: Any, *args: Any) -> Any:
+        return super().compute_reward(traj, task, *args) - np.float32(1.0)
+
+
+@breaks("The sparse reward of an unsuccessful step is not 0")
 class LeakingReward(LineFamily):
     def compute_reward(self, traj: Any, task: Any, *args: Any) -> Any:
         return super().compute_reward(traj, task, *args) - np.abs(np.asarray(task, dtype=np.float32))

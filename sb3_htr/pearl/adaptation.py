@@ -10,6 +10,8 @@ from sb3_htr.pearl.policies import PEARLPolicy
 # posterior of an episode that only grazed its goal can be narrow and beside it, so each setback widens it by its deviation.
 # By measurement on the Point Robot, last return with 2 and no widening 12.1, with 4 and widening 12.3, with 6 12.2.
 MAX_SETBACKS = 4
+# A return without its task-free part is that much above 0, or it is 0: the difference of two sums of float32
+ROUNDING = 1e-5
 
 
 class Adaptation:
@@ -72,7 +74,7 @@ class Adaptation:
         ended = np.flatnonzero(dones)
         if len(ended) == 0:
             return
-        better = ended[self._episode_return[ended] > self.best_return[ended]]
+        better = ended[self._episode_return[ended] > self.best_return[ended] + ROUNDING]
         self.best_return[better] = self._episode_return[better]
         self._best[better] = np.stack([self._episode_start, self._n_rows], axis=1)[better]
         self._best_z[better] = self.z[better]
@@ -90,6 +92,14 @@ class Adaptation:
         if self.explorer is Explorer.PRIOR:
             return self.n_episodes < self.n_exploration_episodes
         return self.best_return <= 0
+
+    def frozen_z(self) -> np.ndarray:
+        """
+        :return: (n_envs, latent_dim), the z to act with when no more episodes follow: that of the best episode, unless its
+            posterior has not been tried yet
+        """
+        tried = (self._setbacks > 0) & (self.explorer is not Explorer.PRIOR) & ~self.exploring()
+        return np.where(tried[:, None], self._best_z, self.z)
 
     def _draw(self, envs: np.ndarray) -> None:
         """New z for some envs."""

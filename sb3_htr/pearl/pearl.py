@@ -438,7 +438,7 @@ class PEARL(SAC):
             warnings.warn(
                 f"No reward was found in {n_episodes} episodes, so the agent is not adapted: allow more.", stacklevel=2
             )
-        return AdaptedAgent(self.policy, adaptation.z[0].copy(), record.returns[0], record.successes[0])
+        return AdaptedAgent(self.policy, adaptation.frozen_z()[0], record.returns[0], record.successes[0])
 
     def predict(
         self,

@@ -44,7 +44,8 @@ class TaskBank:
         valid = np.arange(episodes.shape[1]) < length[:, None]
         returns = (reward * valid[:, None]).sum(axis=-1)
         best = returns.argmax(axis=0)
-        better = np.flatnonzero(returns.max(axis=0) > self.best_return)
+        # A little more, because the rewards are a difference of float32
+        better = np.flatnonzero(returns.max(axis=0) > self.best_return + 1e-5)
         self.best_return[better] = returns[best[better], better]
         self.length[better] = length[best[better]]
         self.episodes[better] = episodes[best[better]]
