@@ -71,7 +71,7 @@ def plot_adaptation_paths(
     columns = min(3, len(order))
     rows = -(-len(order) // columns)
     figure, grid = plt.subplots(
-        rows, columns, figsize=(3.1 * columns, 2.4 * rows + 0.4), squeeze=False, sharex=True, sharey=True, layout="constrained"
+        rows, columns, figsize=(3.1 * columns, 2.1 * rows + 0.5), squeeze=False, sharex=True, sharey=True, layout="constrained"
     )
     for axes in grid.flat[len(order) :]:
         axes.set_visible(False)
@@ -96,6 +96,8 @@ def plot_adaptation_paths(
         plt.Line2D([], [], color=GREEN, marker="o", linestyle="", alpha=0.5, markersize=9, label="hidden goal"),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
-    figure.supxlabel("x", fontsize=10)
-    figure.supylabel("y", fontsize=10)
+    for axes in grid[-1]:
+        axes.set_xlabel("x")
+    for axes in grid[:, 0]:
+        axes.set_ylabel("y")
     _save(figure, path)
