@@ -9,7 +9,7 @@ class EpisodeIndex(NamedTuple):
     """
     The stored transitions as one virtual list, ordered by task and within a task from the oldest to the newest episode.
 
-    Ranges are half-open and follow numpy's convention: task i owns rows ``task_row[i]:task_row[i + 1]``.
+    Ranges are half-open: task i owns rows ``task_row[i]:task_row[i + 1]``.
 
     :param rows: (n_transitions,) int, position of each transition in ``EpisodeStore.rows``
     :param episode_row: (n_episodes + 1,) int, first virtual row of each episode
@@ -27,7 +27,7 @@ class EpisodeIndex(NamedTuple):
 
 class EpisodeStore:
     """
-    One float32 array of slots; a slot holds one episode, and each task owns a ring of slots.
+    One float32 array of slots; a slot holds one episode, and each task owns a ring of slots. Tasks can be added later.
 
     Slots are allocated when first needed and the array grows by doubling, so an empty store costs nothing.
 
@@ -38,7 +38,6 @@ class EpisodeStore:
     """
 
     def __init__(self, n_tasks: int, episodes_per_task: int, episode_length: int, row_dim: int) -> None:
-        self.n_tasks = n_tasks
         self.episodes_per_task = episodes_per_task
         self.episode_length = episode_length
         self.n_added = np.zeros(n_tasks, dtype=np.int64)
@@ -47,12 +46,18 @@ class EpisodeStore:
         self._lengths = np.zeros(0, dtype=np.int64)
         self._data = np.zeros((0, episode_length, row_dim), dtype=np.float32)
         self._index: EpisodeIndex | None = None
+        self._n_first_tasks = n_tasks
         self._new: list[int] = []
 
     @property
     def rows(self) -> np.ndarray:
         """All slots as (n_slots * episode_length, row_dim); see :class:`EpisodeIndex` for the rows that hold data."""
         return self._data.reshape(-1, self._data.shape[-1])
+
+    @property
+    def n_tasks(self) -> int:
+        """Number of tasks, those added later among them."""
+        return len(self.n_added)
 
     @property
     def nbytes(self) -> int:
@@ -74,12 +79,23 @@ class EpisodeStore:
         self._lengths[slot] = len(episode)
         self.n_added[task] += 1
         self._index = None
-        self._new.append(slot)
+        if task < self._n_first_tasks:
+            self._new.append(slot)
+
+    def add_task(self) -> int:
+        """
+        :return: index of a new task, without episodes
+        """
+        if self.n_tasks == len(self._slots):
+            self._slots = np.concatenate([self._slots, np.full_like(self._slots, -1)])
+        self.n_added = np.append(self.n_added, 0)
+        self._index = None
+        return self.n_tasks - 1
 
     def take_new(self) -> tuple[np.ndarray, np.ndarray]:
         """
         :return: the episodes added since the last call (n, episode_length, row_dim), and their lengths (n,); rows beyond an
-            episode's length hold anything
+            episode's length hold anything. Episodes of tasks that were added later are copies, and left out
         """
         # A slot that was overwritten since is listed twice
         slots = np.unique(np.array(self._new, dtype=np.int64))
@@ -88,7 +104,7 @@ class EpisodeStore:
 
     def forget_taken(self) -> None:
         """Let :meth:`take_new` return every stored episode again."""
-        self._new = list(range(self._n_slots))
+        self._new = self._slots[: self._n_first_tasks][self._slots[: self._n_first_tasks] >= 0].tolist()
 
     def _allocate(self) -> int:
         if self._n_slots == len(self._data):
@@ -108,7 +124,7 @@ class EpisodeStore:
             count = np.minimum(self.n_added, self.episodes_per_task)
             age = np.arange(count.max(initial=0))
             position = ((self.n_added - count)[:, None] + age) % self.episodes_per_task
-            slots = np.take_along_axis(self._slots, position, axis=1)[age < count[:, None]]
+            slots = np.take_along_axis(self._slots[: self.n_tasks], position, axis=1)[age < count[:, None]]
             lengths = self._lengths[slots]
             task_episode = np.concatenate([[0], np.cumsum(count)])
             episode_row = np.concatenate([[0], np.cumsum(lengths)])

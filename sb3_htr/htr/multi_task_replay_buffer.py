@@ -9,7 +9,7 @@ from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_htr.common.type_aliases import MultiTaskSamples, TaskFamily, Trajectory
-from sb3_htr.htr.episode_store import EpisodeStore
+from sb3_htr.htr.episode_store import EpisodeIndex, EpisodeStore
 from sb3_htr.htr.hindsight_task import HindsightTaskStrategy, select_step, to_hindsight_task_strategy
 
 
@@ -67,6 +67,9 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         draws context from recently collected data)
     :param seed: seed of the buffer's own random generators
     """
+
+    # Whether rewards of hindsight tasks are computed when they are drawn ("lazy"), or are stored ("eager")
+    relabels_at_sample_time = True
 
     def __init__(
         self,
@@ -134,9 +137,14 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         self._rng, self._relabel_rng = (np.random.default_rng(child) for child in sequence.spawn(2))
 
     @property
+    def n_tasks(self) -> int:
+        """Number of training tasks."""
+        return len(self.task_family.train_tasks)
+
+    @property
     def n_episodes(self) -> np.ndarray:
         """(n_tasks,) int, complete episodes stored for each training task."""
-        return np.diff(self.episodes.index().task_episode)
+        return np.diff(self.episodes.index().task_episode)[: self.n_tasks]
 
     @property
     def context_dim(self) -> int:
@@ -147,7 +155,13 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         """
         :return: number of stored transitions, unfinished episodes not counted
         """
-        return int(self.episodes.index().task_row[-1])
+        return int(self.episodes.index().task_row[self.n_tasks])
+
+    def stats(self) -> dict[str, float]:
+        """
+        :return: what is worth logging, by its key
+        """
+        return {"replay/transitions": self.size(), "replay/megabytes": self.episodes.nbytes / 1e6}
 
     def add(
         self,
@@ -173,10 +187,10 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         task = np.array([info.get("task_id", -1) for info in infos], dtype=np.int64)
         timeout = np.array([info.get("TimeLimit.truncated", False) for info in infos])
         env, step = np.arange(self.n_envs), self._open_length
-        if (bad := (task < 0) | (task >= self.episodes.n_tasks)).any():
+        if (bad := (task < 0) | (task >= self.n_tasks)).any():
             raise ValueError(
                 f"info['task_id'] is {infos[int(bad.argmax())].get('task_id')}, expected a training task from 0 to "
-                f"{self.episodes.n_tasks - 1}: only training tasks may enter the replay buffer."
+                f"{self.n_tasks - 1}: only training tasks may enter the replay buffer."
             )
         if (bad := (step > 0) & (task != self._open_task)).any():
             i = int(bad.argmax())
@@ -196,8 +210,11 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         self._open_task = task
         self._open_length = step + 1
         for ended in np.flatnonzero(done):
-            self.episodes.add(task[ended], self._open[ended, : self._open_length[ended]])
+            self._end_episode(int(task[ended]), self._open[ended, : self._open_length[ended]])
             self._open_length[ended] = 0
+
+    def _end_episode(self, task: int, episode: np.ndarray) -> None:
+        self.episodes.add(task, episode)
 
     def _raise_not_finite(self, rows: np.ndarray, task: np.ndarray) -> None:
         i = int((~np.isfinite(rows)).any(axis=1).argmax())
@@ -218,7 +235,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
     def reset(self) -> None:
         """Remove all episodes."""
         store = self.episodes
-        self.episodes = EpisodeStore(store.n_tasks, store.episodes_per_task, store.episode_length, store.rows.shape[1])
+        self.episodes = EpisodeStore(self.n_tasks, store.episodes_per_task, store.episode_length, store.rows.shape[1])
         self.discard_open_episodes()
 
     def trajectory(self, rows: np.ndarray) -> Trajectory:
@@ -259,30 +276,18 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         :raises ValueError: if no episode is complete yet, or the reward hook returns NaN or infinity
         """
         index = self.episodes.index()
-        if len(index.tasks) == 0:
+        collected = index.tasks[index.tasks < self.n_tasks]
+        if len(collected) == 0:
             raise ValueError("The replay buffer holds no complete episode of any task: collect some before sampling.")
-        tasks = index.tasks[self._rng.integers(len(index.tasks), size=meta_batch_size)]
-        # Plain PEARL: RL batch from all of the task's replay, context from its latest episodes
-        start, end = index.task_row[tasks], index.task_row[tasks + 1]
-        latest = np.maximum(index.task_episode[tasks + 1] - self.context_episodes, index.task_episode[tasks])
-        rl = spread(self._rng, start, end - start, np.full(meta_batch_size, batch_size), batch_size)
-        context, context_length = self._draw_context(self._rng, index.episode_row[latest], end, context_size)
-        # SER: overwrite some rows of the meta-batch by steps of one episode
-        relabelled = self._relabel_rng.random(meta_batch_size) < self.relabel_probability
+        tasks = collected[self._rng.integers(len(collected), size=meta_batch_size)]
+        context, context_length, rl = self._draw_task(self._rng, index, tasks, batch_size, context_size)
+        relabelled = self._draw_relabelled(meta_batch_size)
         reward_task = self.task_family.train_tasks[tasks]
         if relabelled.any():
-            rng, task = self._relabel_rng, tasks[relabelled]
-            n_episodes = index.task_episode[task + 1] - index.task_episode[task]
-            episode = index.task_episode[task] + (rng.random(len(task)) * n_episodes).astype(np.int64)
-            start, end = index.episode_row[episode], index.episode_row[episode + 1]
-            context[relabelled], context_length[relabelled] = self._draw_context(rng, start, end, context_size)
-            if self.rl_batch_source == "episode":
-                rl[relabelled] = spread(rng, start, end - start, np.full(len(task), batch_size), batch_size)
-            step = start + select_step(self.hindsight_task_strategy, end - start, rng)
-            reached = self.trajectory(self.episodes.rows[index.rows[step]][:, None])
-            reward_task[relabelled] = self.task_family.hindsight_task(reached, 0)
+            draw = self._draw_hindsight(index, tasks[relabelled], rl[relabelled], context_size)
+            context[relabelled], context_length[relabelled], rl[relabelled], reward_task[relabelled] = draw
         rows = self.episodes.rows[index.rows[np.concatenate([context, rl], axis=1)]]
-        if relabelled.any():
+        if self.relabels_at_sample_time and relabelled.any():
             self._write_rewards(rows, relabelled, slice(None), reward_task, "sparse")
         if self.rl_reward_type == "dense":
             self._write_rewards(rows, np.full(meta_batch_size, True), slice(context_size, None), reward_task, "dense")
@@ -302,6 +307,34 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             task_ids=tasks,
             relabelled=relabelled,
         )
+
+    def _draw_relabelled(self, meta_batch_size: int) -> np.ndarray:
+        """(M,) bool, which rows of the meta-batch are relabelled."""
+        return self._relabel_rng.random(meta_batch_size) < self.relabel_probability
+
+    def _draw_task(
+        self, rng: np.random.Generator, index: EpisodeIndex, tasks: np.ndarray, batch_size: int, context_size: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """As PEARL: RL batch from all of a task's replay, context from its latest episodes. Context, its length, RL batch."""
+        start, end = index.task_row[tasks], index.task_row[tasks + 1]
+        latest = np.maximum(index.task_episode[tasks + 1] - self.context_episodes, index.task_episode[tasks])
+        rl = spread(rng, start, end - start, np.full(len(tasks), batch_size), batch_size)
+        return *self._draw_context(rng, index.episode_row[latest], end, context_size), rl
+
+    def _draw_hindsight(
+        self, index: EpisodeIndex, tasks: np.ndarray, rl: np.ndarray, context_size: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """SER: one episode and one hindsight task that it reached. Context, its length, RL batch, hindsight tasks."""
+        rng = self._relabel_rng
+        n_episodes = index.task_episode[tasks + 1] - index.task_episode[tasks]
+        episode = index.task_episode[tasks] + (rng.random(len(tasks)) * n_episodes).astype(np.int64)
+        start, end = index.episode_row[episode], index.episode_row[episode + 1]
+        context, context_length = self._draw_context(rng, start, end, context_size)
+        if self.rl_batch_source == "episode":
+            rl = spread(rng, start, end - start, np.full(len(tasks), rl.shape[1]), rl.shape[1])
+        step = start + select_step(self.hindsight_task_strategy, end - start, rng)
+        reached = self.trajectory(self.episodes.rows[index.rows[step]][:, None])
+        return context, context_length, rl, self.task_family.hindsight_task(reached, 0)
 
     @staticmethod
     def _draw_context(

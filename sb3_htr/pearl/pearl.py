@@ -368,6 +368,8 @@ class PEARL(SAC):
             )
         for key in logs[0]:
             self.logger.record(f"train/{key}", th.stack([log[key] for log in logs]).mean().item())
+        for key, value in self.replay_buffer.stats().items():
+            self.logger.record(key, value)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self._update_latent_prior(th.cat(means[-20:]))
 
