@@ -12,6 +12,7 @@ from conftest import ENV_ID, TINY
 
 from sb3_htr import PEARL
 from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.htr import EpisodeClustering
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.hyperparams import hyperparams_file
 
@@ -77,6 +78,13 @@ def test_env_kwargs_of_the_yaml_reach_the_evaluation(tmp_path: Path) -> None:
     # Every goal disc of this distance holds the start, so that all adaptations find it at once
     evaluations = np.load(tmp_path / "pearl" / f"{ENV_ID}_1" / "evaluations.npz")
     assert evaluations["successes"].all(axis=(0, 1))[0]
+
+
+def test_episode_clustering_can_be_asked_for_by_name(tmp_path: Path) -> None:
+    arguments = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-n", "240", "--eval-freq", "-1", "--verbose", "0"]
+    assert main([*arguments, "-params", *SMALL, "replay_buffer_class:'EpisodeClustering'"]) == 0
+    model = PEARL.load(tmp_path / "pearl" / f"{ENV_ID}_1" / ENV_ID)
+    assert model.replay_buffer_class is EpisodeClustering
 
 
 def test_help_and_mistakes(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

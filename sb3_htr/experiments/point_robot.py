@@ -1,4 +1,4 @@
-"""SparsePointRobot-v0: HTR against PEARL without relabelling, both on the true sparse reward."""
+"""SparsePointRobot-v0: HTR against PEARL without relabelling, and against PEARL with a dense proxy reward."""
 
 import argparse
 from collections.abc import Sequence
@@ -15,10 +15,12 @@ def cells(n_seeds: int, n_timesteps: int) -> list[Cell]:
     """
     :param n_seeds: runs per method
     :param n_timesteps: budget of env steps
-    :return: HTR with this library's defaults; PEARL as its paper has it: no relabelling, z from N(0, I) when exploring; and
-        the defaults but for the relabelling
+    :return: HTR with this library's defaults, by sample-time relabelling (SER) and by episode clustering (EC); PEARL as its
+        paper has it: no relabelling, z from N(0, I) when exploring; the defaults but for the relabelling; and those with the
+        dense proxy reward for actor and critics
     """
     no_relabelling: dict[str, Any] = {"replay_buffer_kwargs": {"relabel_probability": 0.0}}
+    dense = {"replay_buffer_kwargs": {"relabel_probability": 0.0, "rl_reward_type": "dense"}}
     plain = {**no_relabelling, "train_explorer": "prior", "explorer": "prior"}
     return [
         cell
@@ -27,6 +29,8 @@ def cells(n_seeds: int, n_timesteps: int) -> list[Cell]:
             Cell(ENV_ID, "htr-ser", seed, n_timesteps),
             Cell(ENV_ID, "pearl-sparse", seed, n_timesteps, hyperparams=plain, explorers=("prior",)),
             Cell(ENV_ID, "pearl-sparse-search", seed, n_timesteps, hyperparams=no_relabelling),
+            Cell(ENV_ID, "htr-ec", seed, n_timesteps, hyperparams={"replay_buffer_class": "EpisodeClustering"}),
+            Cell(ENV_ID, "pearl-dense", seed, n_timesteps, hyperparams=dense),
         )
     ]
 

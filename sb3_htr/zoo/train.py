@@ -24,6 +24,7 @@ from sb3_htr import PEARL
 from sb3_htr.common.callbacks import MetaEvalCallback, MetaTrialEvalCallback
 from sb3_htr.common.checkpoint import CheckpointCallback, atomic_path
 from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.htr import EpisodeClustering
 from sb3_htr.zoo.hyperparams import hyperparams_file
 
 PACKAGES = ("sb3_htr", "stable_baselines3", "gymnasium", "rl_zoo3", "torch", "numpy", "mujoco")
@@ -106,6 +107,8 @@ def register() -> None:
             "EvalCallback": MetaEvalCallback,
             "TrialEvalCallback": MetaTrialEvalCallback,
             "CheckpointCallback": CheckpointCallback,
+            # so that `replay_buffer_class: EpisodeClustering` in a YAML file is found
+            "EpisodeClustering": EpisodeClustering,
         },
         rl_zoo3.train: {"ExperimentManager": MetaExperimentManager},
     }
