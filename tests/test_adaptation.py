@@ -32,7 +32,7 @@ def test_meta_evaluation_works_before_any_training(tiny_pearl: MakePEARL, explor
 def test_the_number_of_envs_does_not_matter(tiny_pearl: MakePEARL) -> None:
     """Tasks are adapted to side by side or one after the other; with a plan and without noise, the result is the same."""
     model = tiny_pearl().learn(2 * ROLLOUT)
-    model.policy.latent_prior.set_plan(th.randn(5, 3))
+    model.policy.latent_prior.set_plan(th.randn(5, 3), 5)
     tasks = PointRobotFamily().test_tasks[:5]
     results = [record_adaptation(model, make_task_vec_env(ENV_ID, n), tasks, n_episodes=3) for n in (1, 2, 5)]
     for result in results[1:]:
@@ -157,7 +157,7 @@ def play(adaptation: Adaptation, rewards: list[list[float]], length: int = 3) ->
 def test_search_follows_the_plan_until_a_reward_then_the_posterior(tiny_pearl: MakePEARL) -> None:
     policy = tiny_pearl().policy
     plan = th.arange(12.0).reshape(4, 3)
-    policy.latent_prior.set_plan(plan)
+    policy.latent_prior.set_plan(plan, 4)
     adaptation = Adaptation(policy, 2, Explorer.SEARCH, 0, th.Generator().manual_seed(0))
     z = play(adaptation, [[0, 0], [0, 1], [0, 0]])
     for episode in range(4):
@@ -168,7 +168,7 @@ def test_search_follows_the_plan_until_a_reward_then_the_posterior(tiny_pearl: M
 
 def test_search_settles_on_the_best_episode_after_setbacks(tiny_pearl: MakePEARL) -> None:
     policy = tiny_pearl().policy
-    policy.latent_prior.set_plan(th.randn(4, 3))
+    policy.latent_prior.set_plan(th.randn(4, 3), 4)
     adaptation = Adaptation(policy, 1, Explorer.SEARCH, 0, th.Generator().manual_seed(0))
     z = play(adaptation, [[0.0], [5.0], *[[1.0] for _ in range(MAX_SETBACKS)], [5.0], [5.0]])
     for episode in range(2, 2 + MAX_SETBACKS):
@@ -180,7 +180,7 @@ def test_search_settles_on_the_best_episode_after_setbacks(tiny_pearl: MakePEARL
 def test_the_posterior_of_search_sees_the_best_episode_only(tiny_pearl: MakePEARL) -> None:
     """The misses before it, whatever they were, make no difference."""
     policy = tiny_pearl().policy
-    policy.latent_prior.set_plan(th.zeros(4, 3))
+    policy.latent_prior.set_plan(th.zeros(4, 3), 4)
     ends = []
     for length_of_miss in (2, 7):
         adaptation = Adaptation(policy, 1, Explorer.SEARCH, 0, th.Generator().manual_seed(0))
@@ -229,7 +229,7 @@ def test_search_plan_finds_every_task_that_was_ever_reached(tiny_pearl: MakePEAR
 
 def test_the_frozen_agent_acts_with_what_is_known_to_work(tiny_pearl: MakePEARL) -> None:
     policy = tiny_pearl().policy
-    policy.latent_prior.set_plan(th.randn(4, 3))
+    policy.latent_prior.set_plan(th.randn(4, 3), 4)
     adaptation = Adaptation(policy, 2, Explorer.SEARCH, 0, th.Generator().manual_seed(0))
     z = play(adaptation, [[0.0, 0.0], [5.0, 0.0], [1.0, 2.0]])
     np.testing.assert_array_equal(adaptation.frozen_z()[0], z[1][0])  # its posterior was worse

@@ -47,6 +47,7 @@ class WithoutHook(gym.Wrapper[Any, Any, Any, Any]):
             "The observation space is Dict.* but PEARL needs a Box of one axis",
         ),
         (lambda: WithSpaces(gym.make(ENV_ID), action_space=spaces.Discrete(3)), "The action space is Discrete"),
+        (lambda: gym.make(ENV_ID, reward_type="dense"), "reward_type is not 'sparse'.*rl_reward_type"),
         (lambda: PointRobotEnv(), "The env has no time limit"),
         (lambda: VecNormalize(make_task_vec_env(ENV_ID, 2)), "VecNormalize rescales rewards.*pass norm_reward=False"),
         (lambda: DummyVecEnv([lambda: gym.make("Pendulum-v1")]), "no task_family"),

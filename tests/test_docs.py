@@ -22,7 +22,7 @@ PAGES = [path for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.m
 def test_the_code_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     # The README trains for minutes; here it is for a moment
-    code = python_blocks(page).replace("model.learn()", "model.learn(4000)")
+    code = python_blocks(page).replace("model.learn()", "model.learn(8000)")
     (tmp_path / f"page_{page.stem}.py").write_text(code)
     monkeypatch.syspath_prepend(tmp_path)
     importlib.import_module(f"page_{page.stem}")

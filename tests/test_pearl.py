@@ -96,6 +96,7 @@ def test_any_number_of_envs(tiny_pearl: MakePEARL, n_envs: int) -> None:
 
 
 def test_envs_in_processes(tiny_pearl: MakePEARL) -> None:
+    assert make_task_vec_env(f"htr_envs:{ENV_ID}").num_envs == 1
     env = make_vec_env(f"htr_envs:{ENV_ID}", 2, vec_env_cls=SubprocVecEnv)
     try:
         tiny_pearl(env).learn(1)
@@ -224,6 +225,18 @@ def test_the_replay_buffer_is_saved_with_what_was_learnt_of_it(tiny_pearl: MakeP
     np.testing.assert_array_equal(loaded.task_bank.best_return, model.task_bank.best_return)
     a, b = model.replay_buffer.sample(4), loaded.replay_buffer.sample(4)
     assert all((np.asarray(x) == np.asarray(y)).all() for x, y in zip(a, b, strict=True))
+
+
+def test_a_loaded_plan_is_not_replaced_by_a_poorer_one(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    """Without its replay buffer, a model knows few tasks when training goes on."""
+    tiny_pearl().save(tmp_path / "model")
+    loaded = PEARL.load(tmp_path / "model", env=make_task_vec_env(ENV_ID, 4, env_kwargs={"goal_distance": 0.2}))
+    plan = th.randn(3, 3)
+    for n_tasks, kept in ((10**6, True), (1, False)):
+        loaded.policy.latent_prior.set_plan(plan, n_tasks)
+        loaded.learn(ROLLOUT)
+        assert len(loaded.task_bank.solved) > 1  # type: ignore[union-attr]
+        assert th.equal(loaded.policy.latent_prior.plan[:3], plan) == kept
 
 
 # --- prediction

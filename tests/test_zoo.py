@@ -83,7 +83,7 @@ def test_env_kwargs_of_the_yaml_reach_the_evaluation(tmp_path: Path) -> None:
 def test_episode_clustering_can_be_asked_for_by_name(tmp_path: Path) -> None:
     arguments = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-n", "240", "--eval-freq", "-1", "--verbose", "0"]
     assert main([*arguments, "-params", *SMALL, "replay_buffer_class:'EpisodeClustering'"]) == 0
-    model = PEARL.load(tmp_path / "pearl" / f"{ENV_ID}_1" / ENV_ID)
+    model = PEARL.load(tmp_path / "pearl" / f"{ENV_ID}_1" / f"{ENV_ID}.zip")
     assert model.replay_buffer_class is EpisodeClustering
 
 

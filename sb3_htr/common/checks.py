@@ -32,6 +32,18 @@ def get_task_family(env: VecEnv) -> TaskFamily:
     return family
 
 
+def check_reward_is_sparse(env: VecEnv) -> None:
+    """
+    :param env: env to train on
+    :raises ValueError: if it gives the dense proxy reward
+    """
+    if env.has_attr("reward_type") and env.get_attr("reward_type")[0] != "sparse":
+        raise ValueError(
+            "The env's reward_type is not 'sparse', but context and relabelled rewards are: make the env with "
+            "reward_type='sparse', and for the dense baseline pass replay_buffer_kwargs={'rl_reward_type': 'dense'}."
+        )
+
+
 def get_max_episode_steps(env: VecEnv) -> int:
     """
     :param env: env to train on

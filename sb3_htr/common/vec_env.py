@@ -1,5 +1,6 @@
 """Batched task envs for Stable-Baselines3."""
 
+import importlib
 import os
 from collections.abc import Sequence
 from typing import Any
@@ -109,6 +110,9 @@ def make_task_vec_env(
     :param env_kwargs: arguments of the env
     :return: a monitored VecEnv
     """
+    module, _, env_id = env_id.rpartition(":")
+    if module:
+        importlib.import_module(module)
     spec = gym.spec(env_id)
     if spec.vector_entry_point is None:
         return make_vec_env(env_id, n_envs, seed=seed, monitor_dir=monitor_dir, env_kwargs=env_kwargs)

@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     parser = argparse.ArgumentParser(prog="python -m sb3_htr.experiments.point_robot", description=__doc__)
     parser.add_argument("--seeds", type=int, default=5, help="runs per method")
-    parser.add_argument("--timesteps", type=int, default=300_000, help="env steps per run")
+    parser.add_argument("--timesteps", type=int, default=150_000, help="env steps per run")
     parser.add_argument("--jobs", type=int, default=2, help="runs at a time, each on one thread")
     parser.add_argument("--runs", type=Path, default=Path("runs/point_robot"), help="folder for the runs; resumes from it")
     args = parser.parse_args(argv)

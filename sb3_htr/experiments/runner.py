@@ -105,7 +105,10 @@ def run_cell(cell: Cell, folder: Path, eval_freq: int) -> Path:
 def _commit() -> str:
     """Of the code that runs, empty outside a checkout."""
     command = ["git", "rev-parse", "--short", "HEAD"]
-    return subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parent).stdout.strip()
+    try:
+        return subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parent).stdout.strip()
+    except OSError:  # no git
+        return ""
 
 
 def run_cells(cells: list[Cell], folder: Path, jobs: int, eval_freq: int = 10_000) -> dict[Cell, Path]:

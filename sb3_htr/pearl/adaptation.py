@@ -6,7 +6,7 @@ import torch as th
 from sb3_htr.pearl.exploration import Explorer
 from sb3_htr.pearl.policies import PEARLPolicy
 
-# Episodes from the posterior that may be worse than the best one, before the z of that one is acted with for good. The
+# Episodes from the posterior that may be worse than the best one, before the z of that one is acted with again. The
 # posterior of an episode that only grazed its goal can be narrow and beside it, so each setback widens it by its deviation.
 # By measurement on the Point Robot, last return with 2 and no widening 12.1, with 4 and widening 12.3, with 6 12.2.
 MAX_SETBACKS = 4

@@ -11,11 +11,11 @@ class Explorer(Enum):
     How an adaptation draws z before it uses the posterior, and when it starts to use it.
     """
 
-    # z ~ N(0, I) for a fixed number of episodes, then the posterior over all episodes: the protocol of PEARL
+    #: z ~ N(0, I) for a fixed number of episodes, then the posterior over all episodes: the protocol of PEARL
     PRIOR = "prior"
-    # z ~ a Gaussian around all that was visited so far, until an episode is rewarded, then the posterior over the best episode
+    #: z ~ a Gaussian around what was visited so far, until an episode is rewarded, then the posterior over the best episode
     AGGREGATE = "aggregate"
-    # z from the search plan, in its order, until an episode is rewarded, then the posterior over the best episode
+    #: z from the search plan, in its order, until an episode is rewarded, then the posterior over the best episode
     SEARCH = "search"
 
 
@@ -49,6 +49,7 @@ class LatentPrior(nn.Module):
     cholesky: th.Tensor
     plan: th.Tensor
     plan_length: th.Tensor
+    plan_n_tasks: th.Tensor
 
     def __init__(self, latent_dim: int, plan_size: int = 32, aggregate_scale: float = 1.5) -> None:
         super().__init__()
@@ -58,6 +59,7 @@ class LatentPrior(nn.Module):
         self.register_buffer("cholesky", th.eye(latent_dim))
         self.register_buffer("plan", th.zeros(plan_size, latent_dim))
         self.register_buffer("plan_length", th.zeros((), dtype=th.int64))
+        self.register_buffer("plan_n_tasks", th.zeros((), dtype=th.int64))
 
     @property
     def plan_size(self) -> int:
@@ -73,12 +75,14 @@ class LatentPrior(nn.Module):
         jitter = 1e-6 * th.eye(self.latent_dim, device=means.device)
         self.cholesky.copy_(th.linalg.cholesky(centred.T @ centred / len(means) + jitter))
 
-    def set_plan(self, plan: th.Tensor) -> None:
+    def set_plan(self, plan: th.Tensor, n_tasks: int) -> None:
         """
         :param plan: (n, latent_dim), n at most ``plan_size``
+        :param n_tasks: number of training tasks that it covers
         """
         self.plan[: len(plan)] = plan
         self.plan_length.fill_(len(plan))
+        self.plan_n_tasks.fill_(n_tasks)
 
     def sample(self, explorer: Explorer, attempt: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:
         """

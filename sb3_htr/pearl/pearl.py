@@ -185,6 +185,7 @@ class PEARL(SAC):
 
     def _setup_replay(self, env: VecEnv) -> None:
         checks.check_reward_is_not_normalized(env)
+        checks.check_reward_is_sparse(env)
         family: TaskFamily = checks.get_task_family(env)
         replay_buffer_class = cast(type[MultiTaskReplayBuffer], self.replay_buffer_class)
         self.replay_buffer = replay_buffer_class(
@@ -377,14 +378,16 @@ class PEARL(SAC):
         assert self.replay_buffer is not None and self.task_bank is not None
         prior = self.policy.latent_prior
         prior.set_aggregate(means)
-        if len(self.task_bank.solved) > 0:
+        n_solved = len(self.task_bank.solved)
+        # A loaded model's plan is kept until this training knows as many tasks as it was made of
+        if n_solved >= max(int(prior.plan_n_tasks), 1):
             context, mask = self.task_bank.search_plan(self.replay_buffer, prior.plan_size)
             if self._vec_normalize_env is not None:
                 obs = slice(0, self.replay_buffer.obs_dim)
                 context[..., obs] = self._vec_normalize_env.normalize_obs(context[..., obs])
             with th.no_grad():
                 plan, _ = self.encoder(th.as_tensor(context, device=self.device), th.as_tensor(mask, device=self.device))
-            prior.set_plan(plan)
+            prior.set_plan(plan, n_solved)
 
     def start_adaptation(
         self,
@@ -417,7 +420,8 @@ class PEARL(SAC):
         Adapt to one task by trying it.
 
         :param env: env with the task, or an id
-        :param n_episodes: episodes to adapt in; the posterior over them is what the agent acts with
+        :param n_episodes: episodes to adapt in. The agent then acts with the z of the best one, or with a draw from its
+            posterior where none was tried yet (explorer ``"prior"``: with a draw from the posterior over all of them)
         :param task: index of a training task or task vector; by default the task that the env has (if it has none yet, one
             is drawn). The env keeps it.
         :param explorer: how z is drawn before the posterior is used, the model's own by default

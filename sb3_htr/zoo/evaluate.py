@@ -1,6 +1,7 @@
 """``sb3-htr evaluate``: adapt a trained agent to tasks that it has not seen."""
 
 import argparse
+import importlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -86,6 +87,8 @@ def main(argv: Sequence[str]) -> None:
     run = find_run(args.run)
     settings = json.loads((run / "run.json").read_text())
     env_id = settings["env_id"]
+    for package in settings["gym_packages"]:
+        importlib.import_module(package)
     model_path = find_model(run, env_id, args.model)
     model = PEARL.load(model_path, device="cpu")
     env = make_task_vec_env(env_id, 20, env_kwargs=settings["env_kwargs"])

@@ -71,6 +71,7 @@ class MetaExperimentManager(ExperimentManager):
         run = {
             "env_id": self.env_name.gym_id,
             "env_kwargs": self.env_kwargs,
+            "gym_packages": self.args.gym_packages,
             "seed": self.seed,
             "n_timesteps": self.n_timesteps,
             "command": " ".join(sys.argv),
