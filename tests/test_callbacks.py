@@ -1,5 +1,6 @@
 """Evaluation during training, and files that are never half written."""
 
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -70,6 +71,16 @@ def test_checkpoints_can_be_gone_on_from(tiny_pearl: MakePEARL, tmp_path: Path) 
     assert loaded.replay_buffer is not None and loaded.replay_buffer.size() == 4 * ROLLOUT
     loaded.learn(ROLLOUT, reset_num_timesteps=False)
     assert loaded.num_timesteps == 5 * ROLLOUT
+
+
+def test_a_save_that_fails_leaves_the_old_model(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    model = tiny_pearl()
+    model.save(tmp_path / "model")
+    before = (tmp_path / "model.zip").read_bytes()
+    model.not_picklable = threading.Lock()  # type: ignore[attr-defined]
+    with pytest.raises(TypeError):
+        model.save(tmp_path / "model")
+    assert (tmp_path / "model.zip").read_bytes() == before and len(list(tmp_path.iterdir())) == 1
 
 
 def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:

@@ -68,6 +68,18 @@ def test_a_run_goes_on_from_a_checkpoint(runs: Path, capsys: pytest.CaptureFixtu
     assert "Loading replay buffer" in capsys.readouterr().out
 
 
+def test_normalized_runs_are_evaluated_as_they_were_trained(tmp_path: Path) -> None:
+    arguments = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-n", "480", "--eval-freq", "480", "--verbose", "0"]
+    normalize = "normalize:{'norm_obs':True,'norm_reward':False}"
+    assert main([*arguments, "--save-replay-buffer", "-params", *SMALL, normalize]) == 0
+    run = tmp_path / "pearl" / f"{ENV_ID}_1"
+    assert (run / "replay_buffer.pkl").exists()
+    assert main(["evaluate", str(run), "--tasks", "validation"]) == 0
+    # The same model, tasks and seed as in the evaluation during training
+    during = np.load(run / "evaluations.npz")["returns"][0]
+    np.testing.assert_allclose(np.load(run / "adaptation.npz")["returns"], during, atol=1e-4)
+
+
 def test_env_kwargs_of_the_yaml_reach_the_evaluation(tmp_path: Path) -> None:
     """A zoo trap: rl_zoo3 gives them to the training env only."""
     block = {**{k: v for k, v in TINY.items() if k != "seed"}, "policy": "MlpPolicy", "n_timesteps": 240, "n_envs": 4}

@@ -88,8 +88,7 @@ class MetaEvalCallback(EvalCallback):
         if self.last_mean_reward > self.best_mean_reward:
             self.best_mean_reward = self.last_mean_reward
             if self.best_model_save_path is not None:
-                with atomic_path(Path(self.best_model_save_path) / "best_model.zip") as path:
-                    self.model.save(path)
+                self.model.save(Path(self.best_model_save_path) / "best_model.zip")
             if self.callback_on_new_best is not None:
                 continue_training = self.callback_on_new_best.on_step()
         if self.callback is not None:

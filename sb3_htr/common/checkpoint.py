@@ -1,4 +1,4 @@
-"""Files that are never half written."""
+"""Files that are never half written, and checkpoints made of them."""
 
 import os
 import shutil

@@ -163,7 +163,8 @@ def evaluate_adaptation(
     The context of a task's posterior comes from the episodes of this very adaptation and from nowhere else.
 
     :param model: a PEARL
-    :param env: env, VecEnv (its envs adapt side by side, each to a task of its own) or registered id
+    :param env: env, VecEnv (its envs adapt side by side, each to a task of its own) or registered id; in the VecNormalize of
+        the training, if that had one
     :param tasks: (n_tasks, task_dim), by default the test tasks of the env
     :param n_episodes: adaptation episodes per task; 20 in PEARL's reference
     :param n_exploration_episodes: see :class:`sb3_htr.pearl.adaptation.Adaptation`; the model's own by default

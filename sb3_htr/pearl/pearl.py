@@ -3,6 +3,7 @@
 import io
 import pathlib
 import warnings
+from collections.abc import Iterable
 from typing import Any, ClassVar, TypeVar, cast
 
 import gymnasium as gym
@@ -17,6 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.sac import SAC
 
 from sb3_htr.common import checks
+from sb3_htr.common.checkpoint import atomic_path
 from sb3_htr.common.evaluation import run_adaptation
 from sb3_htr.common.type_aliases import TaskFamily
 from sb3_htr.common.vec_env import make_task_vec_env
@@ -469,6 +471,33 @@ class PEARL(SAC):
                 stacklevel=2,
             )
         return self.policy.predict(observation, state, episode_start, deterministic)
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """
+        :param path: file, ``.zip`` is added to a name without suffix; it is replaced at the end or not at all
+        :param exclude: attributes to leave out
+        :param include: attributes to save that would be left out
+        """
+        if isinstance(path, io.IOBase):
+            return super().save(path, exclude, include)
+        path = pathlib.Path(path)
+        with atomic_path(path if path.suffix else path.with_suffix(".zip")) as temporary:
+            super().save(temporary, exclude, include)
+
+    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        """
+        :param path: file, ``.pkl`` is added to a name without suffix; it is replaced at the end or not at all
+        """
+        if isinstance(path, io.IOBase):
+            return super().save_replay_buffer(path)
+        path = pathlib.Path(path)
+        with atomic_path(path if path.suffix else path.with_suffix(".pkl")) as temporary:
+            super().save_replay_buffer(temporary)
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """

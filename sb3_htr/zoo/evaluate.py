@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr import PEARL
@@ -91,7 +92,11 @@ def main(argv: Sequence[str]) -> None:
         importlib.import_module(package)
     model_path = find_model(run, env_id, args.model)
     model = PEARL.load(model_path, device="cpu")
-    env = make_task_vec_env(env_id, 20, env_kwargs=settings["env_kwargs"])
+    env: VecEnv = make_task_vec_env(env_id, 20, env_kwargs=settings["env_kwargs"])
+    statistics = run / env_id / "vecnormalize.pkl"
+    if statistics.exists():
+        env = VecNormalize.load(str(statistics), env)
+        env.training = False
     family = get_task_family(env)
     tasks = getattr(family, f"{args.tasks}_tasks")
     explorer = args.explorer or model.explorer

@@ -11,11 +11,9 @@ from typing import Any
 
 import gymnasium as gym
 import rl_zoo3.train
-import yaml
 from rl_zoo3 import exp_manager
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.utils import ALGOS
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -82,14 +80,6 @@ class MetaExperimentManager(ExperimentManager):
         with atomic_path(Path(self.save_path) / "run.json") as path:
             path.write_text(json.dumps(run, indent=2, default=str))
 
-    def save_trained_model(self, model: BaseAlgorithm) -> None:
-        """
-        :param model: written under the name of its env, as rl_zoo3 does, but never half
-        """
-        with atomic_path(f"{self.save_path}/{self.env_name}.zip") as path:
-            model.save(path)
-        print(f"Saved to {self.save_path}")
-
 
 def _is_installed(name: str) -> bool:
     try:
@@ -115,17 +105,6 @@ def register() -> None:
     }
     for module, classes in replaced.items():
         vars(module).update(classes)
-
-
-def check_hyperparams(path: str) -> None:
-    """
-    :param path: YAML file
-    :raises ValueError: if it is not a mapping of env ids to settings
-    """
-    with open(path) as file:
-        blocks = yaml.safe_load(file)
-    if not isinstance(blocks, dict) or not all(isinstance(block, dict) for block in blocks.values()):
-        raise ValueError(f"{path} is not a hyperparameter file: expected a mapping from env ids to settings.")
 
 
 def main(argv: Sequence[str]) -> None:
