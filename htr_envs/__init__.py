@@ -5,6 +5,7 @@ from gymnasium.envs.registration import register
 from htr_envs.check_task_env import check_task_env
 from htr_envs.point_robot import PointRobotEnv, PointRobotFamily, PointRobotVectorEnv
 from htr_envs.semicircle_goals import SemicircleGoalFamily
+from htr_envs.target_speed import TargetSpeedEnv, TargetSpeedFamily, TargetSpeedVectorEnv
 from htr_envs.task_env import TaskEnv, TaskFamily, Trajectory, at_step, check_reward_type
 from htr_envs.task_vector_env import TaskVectorEnv
 
@@ -13,6 +14,9 @@ __all__ = [
     "PointRobotFamily",
     "PointRobotVectorEnv",
     "SemicircleGoalFamily",
+    "TargetSpeedEnv",
+    "TargetSpeedFamily",
+    "TargetSpeedVectorEnv",
     "TaskEnv",
     "TaskFamily",
     "TaskVectorEnv",
@@ -27,4 +31,10 @@ register(
     entry_point="htr_envs.point_robot:PointRobotEnv",
     vector_entry_point="htr_envs.point_robot:PointRobotVectorEnv",
     max_episode_steps=20,
+)
+register(
+    id="SparseTargetSpeed-v0",
+    entry_point="htr_envs.target_speed:TargetSpeedEnv",
+    vector_entry_point="htr_envs.target_speed:TargetSpeedVectorEnv",
+    max_episode_steps=40,
 )

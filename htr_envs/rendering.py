@@ -21,8 +21,9 @@ WHITE = (255, 255, 255)
 Colour = tuple[int, int, int]
 FloatPoints = NDArray[np.float64]
 
-# Glyphs of 3 x 5 pixels, rows from top to bottom; a font library would be one more dependency for a dozen of signs.
+# Glyphs of 3 x 5 pixels, rows from top to bottom; a font library would be one more dependency for a few signs.
 GLYPHS = {
+    " ": "000 000 000 000 000",
     "-": "000 000 111 000 000",
     "0": "111 101 101 101 111",
     "1": "010 110 010 010 111",
@@ -38,7 +39,10 @@ GLYPHS = {
     "B": "110 101 110 101 110",
     "G": "111 100 101 101 111",
     "L": "100 100 100 100 111",
+    "D": "110 101 101 101 110",
+    "E": "111 100 111 100 111",
     "O": "111 101 101 101 111",
+    "P": "111 101 111 100 100",
     "R": "110 101 110 101 101",
     "S": "111 100 111 001 111",
     "T": "111 010 010 010 010",
@@ -114,6 +118,38 @@ class Canvas:
         )
         self._image[top : top + dots.shape[0], left : left + dots.shape[1]][dots] = colour
 
+    def axes(self) -> None:
+        """Draw both axes with labelled ticks."""
+        half_width, pixel = self._half_width, self.pixel
+        tick = 1 if half_width < 5.0 else 5
+        self.line([(-half_width, 0.0), (half_width, 0.0)], 1, GREY)
+        self.line([(0.0, -half_width), (0.0, half_width)], 1, GREY)
+        for value in range(-4 * tick, 5 * tick, tick):
+            if value and abs(value) < 0.93 * half_width:  # nearer to the edge the label would be cut
+                self.line([(value, -4 * pixel), (value, 4 * pixel)], 1, DARK_GREY)
+                self.line([(-4 * pixel, value), (4 * pixel, value)], 1, DARK_GREY)
+                self.text((value - 4 * pixel, -8 * pixel), str(value), DARK_GREY)
+                self.text((8 * pixel, value + 5 * pixel), str(value), DARK_GREY)
+
+    def legend(self, entries: list[tuple[str, Colour | None]]) -> None:
+        """Explain what is drawn, at the top left: words with a disc of their colour, or a black cross where that is None."""
+        for row, (word, colour) in enumerate(entries):
+            left, middle = (8 - SIZE / 2) * self.pixel, (SIZE / 2 - 13 - 16 * row) * self.pixel
+            if colour is None:
+                self.cross((left + 5 * self.pixel, middle), 4, BLACK)
+            else:
+                self.disc((left + 5 * self.pixel, middle), 5 * self.pixel, colour)
+            self.text((left + 16 * self.pixel, middle + 5 * self.pixel), word, DARK_GREY)
+
+    def path(self, points: FloatArray) -> None:
+        """Draw a path (n, 2): a cross at its start, a large disc at its end, small ones in between."""
+        self.line(points, 2, BLUE)
+        for point in points[1:-1]:
+            self.disc(point, 3 * self.pixel, BLUE)
+        self.cross(points[0], 6, BLACK)
+        self.disc(points[-1], 8 * self.pixel, WHITE)
+        self.disc(points[-1], 7 * self.pixel, BLUE)
+
     def image(self) -> NDArray[np.uint8]:
         """The picture so far, shape (400, 400, 3)."""
         return self._image.round().astype(np.uint8)
@@ -133,35 +169,32 @@ def draw_point_robot(path: FloatArray, goal: FloatArray, goal_distance: float, g
     # 20 steps lead at most 2 along each axis: a robot of that episode length never leaves the picture
     half_width = max(2.2, 1.1 * goal_distance + goal_radius)
     canvas = Canvas(half_width)
-    pixel = canvas.pixel
-
     canvas.circle((0.0, 0.0), goal_distance, 3, PALE_ORANGE, upper_half=True)
-    tick = 1 if half_width < 5.0 else 5
-    canvas.line([(-half_width, 0.0), (half_width, 0.0)], 1, GREY)
-    canvas.line([(0.0, -half_width), (0.0, half_width)], 1, GREY)
-    for value in range(-2 * tick, 3 * tick, tick):
-        if value and abs(value) < 0.93 * half_width:  # nearer to the edge the label would be cut
-            canvas.line([(value, -4 * pixel), (value, 4 * pixel)], 1, DARK_GREY)
-            canvas.line([(-4 * pixel, value), (4 * pixel, value)], 1, DARK_GREY)
-            canvas.text((value - 4 * pixel, -8 * pixel), str(value), DARK_GREY)
-            canvas.text((8 * pixel, value + 5 * pixel), str(value), DARK_GREY)
+    canvas.axes()
 
     reached = bool(np.hypot(*(path[-1] - goal)) < goal_radius)
     canvas.disc(goal, goal_radius, ORANGE, 1.0 if reached else 0.5)
     canvas.circle(goal, goal_radius, 2, ORANGE)
 
-    canvas.line(path, 2, BLUE)
-    for position in path[1:-1]:
-        canvas.disc(position, 3 * pixel, BLUE)
-    canvas.cross(path[0], 6, BLACK)
-    canvas.disc(path[-1], 8 * pixel, WHITE)
-    canvas.disc(path[-1], 7 * pixel, BLUE)
+    canvas.path(path)
+    canvas.legend([("GOAL", ORANGE), ("START", None), ("ROBOT", BLUE)])
+    return canvas.image()
 
-    left, top = -half_width + 8 * pixel, half_width - 8 * pixel
-    swatch = (left + 5 * pixel, top - 5 * pixel)
-    canvas.disc(swatch, 5 * pixel, ORANGE)
-    canvas.cross((swatch[0], swatch[1] - 16 * pixel), 4, BLACK)
-    canvas.disc((swatch[0], swatch[1] - 32 * pixel), 5 * pixel, BLUE)
-    for row, word in enumerate(("GOAL", "START", "ROBOT")):
-        canvas.text((left + 16 * pixel, top - 16 * row * pixel), word, DARK_GREY)
+
+def draw_target_speed(path: FloatArray, speed: float, tolerance: float) -> NDArray[np.uint8]:
+    """Draw one episode of the sledge in the plane of its velocities: axes, the ring that solves the task, the path.
+
+    The ring is filled strongly while the speed is held.
+
+    :param path: velocities from the start up to now, shape (n, 2).
+    :param speed: the episode's target speed.
+    :param tolerance: half the width of the ring.
+    :return: picture (400, 400, 3), uint8.
+    """
+    canvas = Canvas(4.2)
+    held = bool(abs(np.hypot(*path[-1]) - speed) < tolerance)
+    canvas.circle((0.0, 0.0), speed, 2 * tolerance / canvas.pixel, ORANGE if held else PALE_ORANGE)
+    canvas.axes()
+    canvas.path(path)
+    canvas.legend([("TARGET SPEED", ORANGE), ("START", None), ("SLEDGE", BLUE)])
     return canvas.image()

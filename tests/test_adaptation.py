@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch as th
 from conftest import ENV_ID
+from hypothesis import given
+from hypothesis import strategies as st
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from htr_envs import PointRobotFamily
@@ -16,7 +18,9 @@ from sb3_htr.common.evaluation import record_adaptation
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.pearl.adaptation import MAX_SETBACKS, Adaptation
 from sb3_htr.pearl.exploration import Explorer, LatentPrior
+from sb3_htr.pearl.policies import PEARLPolicy
 from sb3_htr.pearl.task_bank import TaskBank
+from sb3_htr.pearl.task_belief import KnownTasks, TaskBelief
 
 MakePEARL = Callable[..., PEARL]
 ROLLOUT = 4 * 3 * 20
@@ -30,9 +34,9 @@ def test_meta_evaluation_works_before_any_training(tiny_pearl: MakePEARL, explor
 
 
 def test_the_number_of_envs_does_not_matter(tiny_pearl: MakePEARL) -> None:
-    """Tasks are adapted to side by side or one after the other; with a plan and without noise, the result is the same."""
+    """Tasks are adapted to side by side or one after the other; while nothing is found, the result is the same."""
     model = tiny_pearl().learn(2 * ROLLOUT)
-    model.policy.latent_prior.set_plan(th.randn(5, 3), 5)
+    known_tasks(model.policy)
     tasks = PointRobotFamily().test_tasks[:5]
     results = [record_adaptation(model, make_task_vec_env(ENV_ID, n), tasks, n_episodes=3) for n in (1, 2, 5)]
     for result in results[1:]:
@@ -141,6 +145,15 @@ def test_bad_requests(tiny_pearl: MakePEARL, call: Callable[[PEARL], Any], messa
 # --- how z is chosen
 
 
+def known_tasks(policy: PEARLPolicy, n: int = 4, first_success: float = 2) -> KnownTasks:
+    """Tasks without likeness: acting as if it were one of them finds that one alone, after ``first_success`` steps."""
+    identity = np.eye(n, dtype=np.float32)
+    z = np.arange(n * policy.latent_dim, dtype=np.float32).reshape(n, -1)
+    known = KnownTasks(z, 5 * identity, np.where(identity, first_success, np.inf).astype(np.float32))
+    policy.latent_prior.set_known_tasks(known)
+    return known
+
+
 def play(adaptation: Adaptation, rewards: list[list[float]], length: int = 3) -> list[np.ndarray]:
     """Episodes of ``length`` steps with the given return per env; the z of each episode."""
     z = []
@@ -154,21 +167,56 @@ def play(adaptation: Adaptation, rewards: list[list[float]], length: int = 3) ->
     return [*z, adaptation.z.copy()]
 
 
-def test_search_follows_the_plan_until_a_reward_then_the_posterior(tiny_pearl: MakePEARL) -> None:
+def test_search_tries_every_known_task_once_until_a_reward(tiny_pearl: MakePEARL) -> None:
     policy = tiny_pearl().policy
-    plan = th.arange(12.0).reshape(4, 3)
-    policy.latent_prior.set_plan(plan, 4)
+    z_known = known_tasks(policy).z
     adaptation = Adaptation(policy, 2, Explorer.SEARCH, 0, th.Generator().manual_seed(0))
-    z = play(adaptation, [[0, 0], [0, 1], [0, 0]])
-    for episode in range(4):
-        np.testing.assert_array_equal(z[episode][0], plan[episode % 4])
-    np.testing.assert_array_equal(z[1][1], plan[1])
-    assert not (z[2][1] == plan.numpy()).all(axis=1).any(), "the second env was rewarded, so it uses the posterior"
+    z = np.stack(play(adaptation, [[0, 0], [0, 5], [0, 4], [0, 4]])[:4])
+    assert sorted(map(tuple, z[:, 0])) == sorted(map(tuple, z_known)), "the first env has seen no reward"
+    visited = (z[:, 1, None] == z_known).all(axis=2).any(axis=1)
+    assert visited[:2].all()
+    # The reward was that of the task visited, so the best guess is another one, and then it is the posterior's turn
+    assert not visited[3], "after a reward and a setback, the posterior is used"
+
+
+def test_a_visit_that_fails_turns_to_another_within_the_episode(tiny_pearl: MakePEARL) -> None:
+    policy = tiny_pearl().policy
+    z_known = known_tasks(policy, n=8, first_success=3).z
+    adaptation = Adaptation(policy, 1, Explorer.SEARCH, 0, th.Generator().manual_seed(0))
+    first = adaptation.z.copy()
+    rows, nothing = np.zeros((1, 2), dtype=np.float32), np.zeros(1)
+    seen = []
+    for _ in range(10):
+        adaptation.observe(rows, rows, nothing, nothing, np.array([False]))
+        seen.append(adaptation.z.copy())
+    assert (seen[3] == first).all(), "the visit has its time, and a fifth more, and a step"
+    assert (seen[4] != first).any()
+    assert (seen[4] == z_known).all(axis=1).any()
+    assert len(np.unique(np.concatenate(seen), axis=0)) == 3
+    # A reward is a reason to stay
+    adaptation.observe(rows, rows, np.ones(1), nothing, np.array([False]))
+    stay = adaptation.z.copy()
+    for _ in range(10):
+        adaptation.observe(rows, rows, nothing, nothing, np.array([False]))
+        assert (adaptation.z == stay).all()
+
+
+def test_an_episode_of_several_visits_is_no_success_to_settle_on(tiny_pearl: MakePEARL) -> None:
+    """Acting with its last z from the start may find nothing."""
+    policy = tiny_pearl().policy
+    known_tasks(policy, n=8, first_success=1)
+    adaptation = Adaptation(policy, 1, Explorer.SEARCH, 0, th.Generator().manual_seed(0))
+    rows, nothing = np.zeros((1, 2), dtype=np.float32), np.zeros(1)
+    for step in range(6):
+        adaptation.observe(rows, rows, np.array([9.0 * (step == 5)]), nothing, np.array([step == 5]))
+    assert not adaptation.exploring()[0]
+    z = play(adaptation, [[1.0], [0.0]])
+    np.testing.assert_array_equal(adaptation.frozen_z(), z[0])
 
 
 def test_search_settles_on_the_best_episode_after_setbacks(tiny_pearl: MakePEARL) -> None:
     policy = tiny_pearl().policy
-    policy.latent_prior.set_plan(th.randn(4, 3), 4)
+    known_tasks(policy, n=12)
     adaptation = Adaptation(policy, 1, Explorer.SEARCH, 0, th.Generator().manual_seed(0))
     z = play(adaptation, [[0.0], [5.0], *[[1.0] for _ in range(MAX_SETBACKS)], [5.0], [5.0]])
     for episode in range(2, 2 + MAX_SETBACKS):
@@ -180,9 +228,9 @@ def test_search_settles_on_the_best_episode_after_setbacks(tiny_pearl: MakePEARL
 def test_the_posterior_of_search_sees_the_best_episode_only(tiny_pearl: MakePEARL) -> None:
     """The misses before it, whatever they were, make no difference."""
     policy = tiny_pearl().policy
-    policy.latent_prior.set_plan(th.zeros(4, 3), 4)
     ends = []
     for length_of_miss in (2, 7):
+        # Without known tasks, only the posterior is used
         adaptation = Adaptation(policy, 1, Explorer.SEARCH, 0, th.Generator().manual_seed(0))
         play(adaptation, [[0]], length_of_miss)
         adaptation.generator = th.Generator().manual_seed(1)
@@ -204,33 +252,85 @@ def test_aggregate_is_as_wide_as_it_says() -> None:
     prior = LatentPrior(2, aggregate_scale=1.5)
     means = th.randn(5000, 2, generator=th.Generator().manual_seed(0)) @ th.tensor([[2.0, 0], [1, 0.5]]) + 3
     prior.set_aggregate(means)
-    z = prior.sample(Explorer.AGGREGATE, th.zeros(20_000, dtype=th.int64), th.Generator().manual_seed(1))
+    z = prior.sample(Explorer.AGGREGATE, 20_000, th.Generator().manual_seed(1))
     th.testing.assert_close(z.mean(dim=0), means.mean(dim=0), atol=0.1, rtol=0)
     th.testing.assert_close(z.T.cov(), 1.5**2 * means.T.cov(), atol=0.3, rtol=0.1)
 
 
-def test_search_plan_finds_every_task_that_was_ever_reached(tiny_pearl: MakePEARL) -> None:
-    """Played back, the episodes of the plan solve all solved training tasks, in few visits."""
+def test_search_finds_a_task_like_those_known_within_few_visits() -> None:
+    """Tasks on a line of which a visit finds its neighbours: the search skips what was ruled out, and no task escapes it."""
+    place = np.arange(40)
+    finds = np.abs(place[:, None] - place) <= 2
+    known = KnownTasks(
+        place[:, None].astype(np.float32), np.where(finds, 5.0, 0.0), np.where(finds, 3.0, np.inf)
+    )  # fmt: skip
+    belief, envs = TaskBelief(known, len(place)), place
+    first = np.zeros(len(place))
+    for visit in range(1, 14):
+        task = belief.to_find(envs)
+        hit = finds[task, envs]
+        first[hit & (first == 0)] = visit
+        belief.missed(envs[~hit], task[~hit], np.full((~hit).sum(), 20))
+        belief.found(envs[hit], task[hit], np.full(hit.sum(), 5.0))
+    assert (first > 0).all()
+    assert first.mean() < 6.5, "40 places, 5 with a visit: 4.5 on average were perfect"
+
+
+def test_belief_tells_two_sides_of_a_grazed_goal_apart() -> None:
+    """Both neighbours of a visit return the same; an earlier miss decides."""
+    place = np.arange(9.0)
+    distance = np.abs(place[:, None] - place)
+    returns = np.where(distance <= 2, 6.0 - 2 * distance, 0.0)
+    known = KnownTasks(place[:, None].astype(np.float32), returns, np.where(returns > 0, 3.0, np.inf))
+    belief = TaskBelief(known, 1)
+    env = np.zeros(1, dtype=np.int64)
+    belief.missed(env, np.array([2]), np.array([20]))  # rules 0 to 4 out
+    belief.found(env, np.array([4]), np.array([2.0]))  # 2 or 6
+    assert belief.to_exploit(env)[0] == 6
+
+
+@given(n=st.integers(1, 6), seed=st.integers(0, 2**16))
+def test_beliefs_stay_probabilities(n: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    returns = np.where(rng.random((n, n)) < 0.5, 0.0, 10 * rng.random((n, n))) + np.eye(n)
+    first = np.where(returns > 0, rng.integers(0, 20, (n, n)), np.inf)
+    belief = TaskBelief(KnownTasks(rng.normal(size=(n, 3)).astype(np.float32), returns, first), 2)
+    envs = np.arange(2)
+    for _ in range(60):
+        task = belief.to_find(envs) if rng.random() < 0.5 else belief.to_exploit(envs)
+        if rng.random() < 0.5:
+            belief.missed(envs, task, rng.integers(0, 30, 2))
+        else:
+            belief.found(envs, task, np.where(rng.random(2) < 0.3, np.nan, 20 * rng.random(2)))
+        assert (task < n).all() and np.isfinite(belief.belief).all()
+        np.testing.assert_allclose(belief.belief.sum(axis=1), 1)
+
+
+def test_known_tasks_are_those_that_were_ever_reached(tiny_pearl: MakePEARL) -> None:
+    """Under the reward formula, written down here once more, each best episode does what it is said to do."""
     model = tiny_pearl(make_task_vec_env(ENV_ID, 4, env_kwargs={"goal_distance": 0.3}))
     model.learn(4 * ROLLOUT)
     bank, buffer = model.task_bank, model.replay_buffer
     assert isinstance(bank, TaskBank) and buffer is not None and len(bank.solved) > 20
-    context, mask = bank.search_plan(buffer, 32)
-    assert (context[..., -1] * mask > 0).any(axis=1).all(), "each context holds the reward of its task"
-    solved = bank.task_family.train_tasks[bank.solved]
-    position = context[..., :2] + 0.1 * context[..., 2:4]
-    distance = np.linalg.norm(position[:, :, None] - solved, axis=-1)
-    found = (distance < 0.2 - 1e-5).any(axis=1)
-    first = np.where(found.any(axis=0), found.argmax(axis=0), 99)
-    assert first.max() < 32 and first.mean() < 6
-    # A visit never goes first where another task would reveal more
-    assert found[0].sum() > len(solved) / 5
+    context, mask, returns, first_success = bank.best_episodes(buffer, 128)
+    tasks = bank.task_family.train_tasks[bank.solved]
+    position = context[..., :2] + 0.1 * np.clip(context[..., 2:4], -1, 1)
+    distance = np.linalg.norm(position[:, None] - tasks[:, None], axis=-1)
+    reward = np.where(distance < 0.2, 1 - distance, 0) * mask[:, None]
+    np.testing.assert_allclose(returns, reward.sum(axis=-1), atol=0.9)  # a step on the rim may count or not
+    assert (np.diag(returns) > 0).all() and (np.diag(first_success) < 20).all()
+    np.testing.assert_array_equal(np.isfinite(first_success), returns > 0)
+    np.testing.assert_allclose(context[..., -1] * mask, np.einsum("iit->it", reward), atol=0.9)
+    known = model.policy.latent_prior.known_tasks()
+    np.testing.assert_array_equal(known.returns, returns)
+    fewer = bank.best_episodes(buffer, 7)
+    assert [len(array) for array in fewer] == [7] * 4
 
 
 def test_the_frozen_agent_acts_with_what_is_known_to_work(tiny_pearl: MakePEARL) -> None:
     policy = tiny_pearl().policy
-    policy.latent_prior.set_plan(th.randn(4, 3), 4)
+    known_tasks(policy)
     adaptation = Adaptation(policy, 2, Explorer.SEARCH, 0, th.Generator().manual_seed(0))
-    z = play(adaptation, [[0.0, 0.0], [5.0, 0.0], [1.0, 2.0]])
-    np.testing.assert_array_equal(adaptation.frozen_z()[0], z[1][0])  # its posterior was worse
-    np.testing.assert_array_equal(adaptation.frozen_z()[1], adaptation.z[1])  # its posterior is not tried yet
+    z = play(adaptation, [[0.0, 0.0], [5.0, 0.0], [1.0, 0.0]])
+    np.testing.assert_array_equal(adaptation.frozen_z()[0], z[1][0])
+    np.testing.assert_array_equal(adaptation.frozen_z()[1], adaptation.z[1])  # nothing is known to work

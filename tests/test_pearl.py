@@ -13,10 +13,12 @@ from conftest import ENV_ID, TINY
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
 from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.pearl.task_belief import KnownTasks
 
 MakePEARL = Callable[..., PEARL]
 ROLLOUT = 4 * 3 * 20  # env steps of one rollout of the tiny settings
@@ -227,16 +229,24 @@ def test_the_replay_buffer_is_saved_with_what_was_learnt_of_it(tiny_pearl: MakeP
     assert all((np.asarray(x) == np.asarray(y)).all() for x, y in zip(a, b, strict=True))
 
 
-def test_a_loaded_plan_is_not_replaced_by_a_poorer_one(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+def test_known_tasks_of_a_loaded_model_are_not_replaced_by_fewer(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
     """Without its replay buffer, a model knows few tasks when training goes on."""
     tiny_pearl().save(tmp_path / "model")
     loaded = PEARL.load(tmp_path / "model", env=make_task_vec_env(ENV_ID, 4, env_kwargs={"goal_distance": 0.2}))
-    plan = th.randn(3, 3)
-    for n_tasks, kept in ((10**6, True), (1, False)):
-        loaded.policy.latent_prior.set_plan(plan, n_tasks)
+    for n, kept in ((128, True), (1, False)):
+        known = KnownTasks(np.ones((n, 3), np.float32), np.eye(n, dtype=np.float32), np.zeros((n, n), np.float32))
+        loaded.policy.latent_prior.set_known_tasks(known)
         loaded.learn(ROLLOUT)
-        assert len(loaded.task_bank.solved) > 1  # type: ignore[union-attr]
-        assert th.equal(loaded.policy.latent_prior.plan[:3], plan) == kept
+        assert 1 < len(loaded.task_bank.solved) < 128  # type: ignore[union-attr]
+        assert (len(loaded.policy.latent_prior.known_tasks().z) == n) == kept
+
+
+def test_schedules_end_where_they_should(tiny_pearl: MakePEARL) -> None:
+    """The last rollout goes beyond the budget; a learning rate below 0 would undo what was learnt."""
+    model = tiny_pearl(learning_rate=LinearSchedule(1e-3, 0.0, 1.0))
+    model.learn(int(1.5 * ROLLOUT))
+    assert model.num_timesteps == 2 * ROLLOUT
+    assert model.actor.optimizer.param_groups[0]["lr"] == 0
 
 
 # --- prediction

@@ -220,7 +220,7 @@ def test_actions_reach_the_reward_hook_in_the_bounds_of_the_env() -> None:
     [
         ({"relabel_probability": 1.5}, "relabel_probability is 1.5, expected a number from 0 to 1"),
         ({"relabel_probability": float("nan")}, "relabel_probability is nan"),
-        ({"hindsight_task_strategy": "best"}, "expected one of .'final', 'random'."),
+        ({"hindsight_task_strategy": "best"}, "expected one of .'even', 'final', 'random'."),
         ({"rl_batch_source": "x"}, "rl_batch_source is 'x'"),
         ({"rl_reward_type": "x"}, "rl_reward_type is 'x'"),
         ({"context_episodes": 0}, "context_episodes is 0"),

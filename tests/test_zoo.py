@@ -15,6 +15,7 @@ from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr import EpisodeClustering
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.hyperparams import hyperparams_file
+from sb3_htr.zoo.train import MetaExperimentManager
 
 SMALL = [
     "n_tasks_per_rollout:4",
@@ -113,7 +114,7 @@ def blocks() -> list[tuple[str, str]]:
 
 @pytest.mark.parametrize(("file", "block"), blocks())
 def test_every_block_of_hyperparameters_trains(file: str, block: str) -> None:
-    settings = yaml.safe_load(hyperparams_file(file).read_text())[block]
+    settings = MetaExperimentManager._preprocess_schedules(yaml.safe_load(hyperparams_file(file).read_text())[block])
     n_envs = settings.pop("n_envs")
     del settings["n_timesteps"]
     env = make_task_vec_env(ENV_ID if block == "default" else block, n_envs)

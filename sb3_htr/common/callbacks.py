@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Any, Protocol, cast
 
 import numpy as np
-from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.logger import CSVOutputFormat
 from stable_baselines3.common.vec_env import sync_envs_normalization
 
 from sb3_htr.common.checkpoint import atomic_path
@@ -110,6 +111,29 @@ class MetaEvalCallback(EvalCallback):
                 f"Eval num_timesteps={self.num_timesteps}: return of adaptation episode 1: {returns[:, 0].mean():.2f}, "
                 f"of episode {returns.shape[1]}: {self.last_mean_reward:.2f}, success {successes[:, -1].mean():.0%}"
             )
+
+
+class ProgressCallback(BaseCallback):
+    """
+    Writes what the algorithm logs to a CSV file too, wherever else it goes.
+
+    :param path: file
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        super().__init__()
+        self.path = os.fspath(path)
+
+    def _on_training_start(self) -> None:
+        self._output = CSVOutputFormat(self.path)
+        self.logger.output_formats.append(self._output)
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_training_end(self) -> None:
+        self.logger.output_formats.remove(self._output)
+        self._output.close()
 
 
 class TrialResult(Protocol):

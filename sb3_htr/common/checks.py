@@ -50,13 +50,17 @@ def get_max_episode_steps(env: VecEnv) -> int:
     :return: its time limit
     :raises ValueError: if it has none
     """
-    spec = env.get_attr("spec")[0] if env.has_attr("spec") else None
-    if spec is None or spec.max_episode_steps is None:
+    if env.has_attr("max_episode_steps"):  # a batched env counts the steps itself
+        limit = env.get_attr("max_episode_steps")[0]
+    else:
+        spec = env.get_attr("spec")[0] if env.has_attr("spec") else None
+        limit = None if spec is None else spec.max_episode_steps
+    if limit is None:
         raise ValueError(
             "The env has no time limit, so its episodes may never end: make it with gymnasium.make(id), "
             "registered with max_episode_steps."
         )
-    return int(spec.max_episode_steps)
+    return int(limit)
 
 
 def check_reward_is_not_normalized(env: VecEnv) -> VecNormalize | None:

@@ -61,6 +61,7 @@ class MultiTaskSamples(NamedTuple):
     :param dones: (M, B), 1 where the episode terminated (time limits do not count)
     :param task_ids: (M,) int array, the training task whose replay each row of the meta-batch came from
     :param relabelled: (M,) bool array, whether context and RL batch carry rewards of a hindsight task
+    :param unrewarded: (M,) bool array, whether no reward of the RL batch has a part that depends on the task
     """
 
     context: th.Tensor
@@ -72,3 +73,4 @@ class MultiTaskSamples(NamedTuple):
     dones: th.Tensor
     task_ids: np.ndarray
     relabelled: np.ndarray
+    unrewarded: np.ndarray

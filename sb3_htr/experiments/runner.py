@@ -19,6 +19,9 @@ from sb3_htr.common.evaluation import evaluate_adaptation
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.zoo.evaluate import find_run
 
+# Means over the training of what HTR paper, B.2 reasons with
+LOGGED = ("relabelled_fraction", "rl_reward_mean", "rl_zero_reward_fraction")
+
 
 @dataclass(frozen=True, eq=False)
 class Cell:
@@ -45,7 +48,8 @@ class Cell:
     @property
     def name(self) -> str:
         """Folder of the run."""
-        return f"{self.method}-seed{self.seed}"
+        kwargs = "".join(f"-{key}{value}" for key, value in self.env_kwargs.items())
+        return f"{self.method}{kwargs}-seed{self.seed}"
 
     def command(self, folder: Path, eval_freq: int) -> list[str]:
         """
@@ -71,8 +75,8 @@ def run_cell(cell: Cell, folder: Path, eval_freq: int) -> Path:
     :param folder: where all cells' folders are; a cell that has a result there is not run again
     :param eval_freq: env steps between evaluations
     :return: npz with ``timesteps``, ``curve`` (n, n_tasks) on validation tasks, and for each explorer
-        ``returns_<explorer>`` and ``successes_<explorer>`` (n_tasks, n_episodes) on test tasks; ``wall_s`` of the training
-        and ``commit`` of the code
+        ``returns_<explorer>`` and ``successes_<explorer>`` (n_tasks, n_episodes) on test tasks; the means of what is in
+        ``LOGGED``; ``wall_s`` of the training and ``commit`` of the code
     """
     result = folder / f"{cell.name}.npz"
     if result.exists():
@@ -86,7 +90,9 @@ def run_cell(cell: Cell, folder: Path, eval_freq: int) -> Path:
     run = find_run(folder / cell.name)
     model = PEARL.load(run / f"{cell.env_id}.zip", device="cpu")
     evaluations = np.load(run / "evaluations.npz")
+    progress = np.genfromtxt(run / "progress.csv", delimiter=",", names=True, deletechars="")
     arrays: dict[str, Any] = {
+        **{key: np.nanmean(progress[f"train/{key}"]) for key in LOGGED},
         "timesteps": evaluations["timesteps"],
         "curve": evaluations["results"],
         "wall_s": wall,

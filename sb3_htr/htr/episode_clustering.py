@@ -5,7 +5,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from sb3_htr.htr.episode_store import EpisodeIndex
-from sb3_htr.htr.hindsight_task import select_step
+from sb3_htr.htr.hindsight_task import choose_rare, select_step
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 
 
@@ -129,15 +129,21 @@ class EpisodeClustering(MultiTaskReplayBuffer):
 
     def _end_episode(self, task: int, episode: np.ndarray) -> None:
         super()._end_episode(task, episode)
-        step = select_step(self.hindsight_task_strategy, np.array([len(episode)]), self._relabel_rng)
-        reached = self.task_family.hindsight_task(self.trajectory(episode), int(step[0]))
-        representative = self.discretiser(reached[None])[0]
+        lengths = np.full(self.hindsight_task_strategy.n_candidates, len(episode))
+        step = select_step(self.hindsight_task_strategy, lengths, self._relabel_rng)
+        representatives = self.discretiser(self.task_family.hindsight_task(self.trajectory(episode), step))
+        count = np.array([1 + self._n_episodes_of(representative) for representative in representatives])
+        representative = representatives[choose_rare(count[None], self._relabel_rng)[0]]
         self._add_hindsight(representative, episode)
         # As many exploratory episodes as make up their share: this one, under a task that others reached
         n_exploratory = self.exploratory_fraction / (1 - self.exploratory_fraction)
         for _ in range(int(n_exploratory + self._relabel_rng.random())):
             other = self._hindsight_tasks[self._relabel_rng.integers(self.n_hindsight_buffers)]
             self._add_hindsight(other, episode)
+
+    def _n_episodes_of(self, hindsight_task: np.ndarray) -> int:
+        buffer = self._buffer_of.get(hindsight_task.tobytes())
+        return 0 if buffer is None else int(self.episodes.n_added[buffer])
 
     def _add_hindsight(self, hindsight_task: np.ndarray, episode: np.ndarray) -> None:
         key = hindsight_task.tobytes()

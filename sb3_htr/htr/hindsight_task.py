@@ -1,4 +1,4 @@
-"""Which state of an episode becomes the hindsight task."""
+"""Which state of which episode becomes the hindsight task."""
 
 from enum import Enum
 
@@ -14,12 +14,20 @@ class HindsightTaskStrategy(Enum):
     RANDOM = 0
     # The last step of the episode
     FINAL = 1
+    # Of several random steps one, with probabilities that even out how often similar tasks are drawn
+    EVEN = 2
+
+    @property
+    def n_candidates(self) -> int:
+        """Number of steps that one is chosen from. By measurement: with 8, a search of the Point Robot widens fast enough."""
+        return 8 if self is HindsightTaskStrategy.EVEN else 1
 
 
 # For convenience, so that YAML files can use strings
 KEY_TO_HINDSIGHT_TASK_STRATEGY = {
     "random": HindsightTaskStrategy.RANDOM,
     "final": HindsightTaskStrategy.FINAL,
+    "even": HindsightTaskStrategy.EVEN,
 }
 
 
@@ -42,10 +50,25 @@ def to_hindsight_task_strategy(strategy: HindsightTaskStrategy | str) -> Hindsig
 def select_step(strategy: HindsightTaskStrategy, lengths: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """
     :param strategy: how to choose
-    :param lengths: (n,) int, number of steps of each episode
+    :param lengths: int, number of steps of each episode, any shape
     :param rng: source of randomness
-    :return: (n,) int, for each episode the index of the step whose achieved task becomes the hindsight task
+    :return: int, same shape, for each episode the index of the step whose achieved task becomes the hindsight task, or a
+        candidate for it
     """
     if strategy is HindsightTaskStrategy.FINAL:
         return lengths - 1
-    return (rng.random(len(lengths)) * lengths).astype(np.int64)
+    return (rng.random(lengths.shape) * lengths).astype(np.int64)
+
+
+def choose_rare(count: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """
+    Choose among candidates with probabilities inverse to how common they are.
+
+    :param count: (n, n_candidates), how often something like the candidate was seen, more than 0
+    :param rng: source of randomness
+    :return: (n,) int, index of the chosen candidate in each row
+    """
+    if count.shape[1] == 1:
+        return np.zeros(len(count), dtype=np.int64)
+    cumulative = np.cumsum(1 / count, axis=1)
+    return (rng.random((len(count), 1)) * cumulative[:, -1:] > cumulative).sum(axis=1)

@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_htr.common.type_aliases import MultiTaskSamples, TaskFamily, Trajectory
 from sb3_htr.htr.episode_store import EpisodeIndex, EpisodeStore
-from sb3_htr.htr.hindsight_task import HindsightTaskStrategy, select_step, to_hindsight_task_strategy
+from sb3_htr.htr.hindsight_task import HindsightTaskStrategy, choose_rare, select_step, to_hindsight_task_strategy
 
 
 def spread(rng: np.random.Generator, start: np.ndarray, length: np.ndarray, size: np.ndarray, width: int) -> np.ndarray:
@@ -57,8 +57,9 @@ class MultiTaskReplayBuffer(ReplayBuffer):
     :param max_episode_steps: time limit of the env
     :param relabel_probability: K, in [0, 1]. K = 0 is plain PEARL, bit for bit. The default was chosen by measurement
         (the paper sweeps .1 to 1 and does not name its best)
-    :param hindsight_task_strategy: which state of the episode is the hindsight task, ``"random"`` (default; our choice, the
-        paper says "e.g., select a state reached") or ``"final"``
+    :param hindsight_task_strategy: which state of an episode is the hindsight task. ``"random"``: any; ``"final"``: the last;
+        ``"even"`` (default): any, those that few others resemble being more probable. The paper says "e.g., select a state
+        reached"; the default is our choice, by measurement
     :param rl_batch_source: ``"episode"`` (B.2, default) draws the RL batch of a relabelled row from the same episode as its
         context; ``"task"`` is the ablation of B.2, the RL batch comes from all of the task's replay
     :param rl_reward_type: ``"sparse"``, or ``"dense"`` for the oracle baseline: RL batches carry the dense proxy reward of
@@ -83,7 +84,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         task_family: TaskFamily,
         max_episode_steps: int,
         relabel_probability: float = 0.8,
-        hindsight_task_strategy: HindsightTaskStrategy | str = "random",
+        hindsight_task_strategy: HindsightTaskStrategy | str = "even",
         rl_batch_source: str = "episode",
         rl_reward_type: str = "sparse",
         context_episodes: int = 10,
@@ -306,6 +307,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             dones=batch[:, context_size:, self._done],
             task_ids=tasks,
             relabelled=relabelled,
+            unrewarded=(rows[:, context_size:, self._reward] == rows[:, context_size:, self._task_free_reward]).all(axis=1),
         )
 
     def _draw_relabelled(self, meta_batch_size: int) -> np.ndarray:
@@ -326,15 +328,26 @@ class MultiTaskReplayBuffer(ReplayBuffer):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """SER: one episode and one hindsight task that it reached. Context, its length, RL batch, hindsight tasks."""
         rng = self._relabel_rng
-        n_episodes = index.task_episode[tasks + 1] - index.task_episode[tasks]
-        episode = index.task_episode[tasks] + (rng.random(len(tasks)) * n_episodes).astype(np.int64)
+        first, end = index.task_episode[tasks, None], index.task_episode[tasks + 1, None]
+        n_candidates = self.hindsight_task_strategy.n_candidates
+        episode = first + (rng.random((len(tasks), n_candidates)) * (end - first)).astype(np.int64)
         start, end = index.episode_row[episode], index.episode_row[episode + 1]
+        step = start + select_step(self.hindsight_task_strategy, end - start, rng)
+        reached = self.trajectory(self.episodes.rows[index.rows[step]][..., None, :])
+        hindsight_task = self.task_family.hindsight_task(reached, 0)
+        chosen = np.arange(len(tasks)), choose_rare(self._count_alike(reached, hindsight_task), rng)
+        start, end = start[chosen], end[chosen]
         context, context_length = self._draw_context(rng, start, end, context_size)
         if self.rl_batch_source == "episode":
             rl = spread(rng, start, end - start, np.full(len(tasks), rl.shape[1]), rl.shape[1])
-        step = start + select_step(self.hindsight_task_strategy, end - start, rng)
-        reached = self.trajectory(self.episodes.rows[index.rows[step]][:, None])
-        return context, context_length, rl, self.task_family.hindsight_task(reached, 0)
+        return context, context_length, rl, hindsight_task[chosen]
+
+    def _count_alike(self, reached: Trajectory, task: np.ndarray) -> np.ndarray:
+        """(n, n_candidates), how many rows solve each candidate's task with their first candidate, plus 1."""
+        if task.shape[1] == 1:
+            return np.ones(task.shape[:2])
+        first = Trajectory(*(values[:, 0] for values in reached))
+        return 1 + self.task_family.is_success(first, task[:, :, None])[..., 0].sum(axis=-1)
 
     @staticmethod
     def _draw_context(

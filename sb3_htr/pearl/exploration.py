@@ -5,6 +5,8 @@ from enum import Enum
 import torch as th
 from torch import nn
 
+from sb3_htr.pearl.task_belief import KnownTasks
+
 
 class Explorer(Enum):
     """
@@ -15,7 +17,8 @@ class Explorer(Enum):
     PRIOR = "prior"
     #: z ~ a Gaussian around what was visited so far, until an episode is rewarded, then the posterior over the best episode
     AGGREGATE = "aggregate"
-    #: z from the search plan, in its order, until an episode is rewarded, then the posterior over the best episode
+    #: z of the training task that the unknown one is most likely to be found with, given the misses so far, until an episode
+    #: is rewarded; then by turns z of the training task that promises most, and the posterior over the best episode
     SEARCH = "search"
 
 
@@ -36,35 +39,37 @@ class LatentPrior(nn.Module):
     What meta-training knows about z before a task gave any reward; saved with the policy, not trained by gradients.
 
     While the KL term is weak, posterior means are far from N(0, I). Two things are kept instead: the *aggregate*, mean and
-    covariance of the posterior means of recent meta-batches, and the *search plan*, a list of z that solve training tasks,
-    ordered such that few episodes visit the places of many tasks (:class:`sb3_htr.pearl.task_bank.TaskBank`).
+    covariance of the posterior means of recent meta-batches, and the *known tasks*: z of solved training tasks, and what
+    acting with each of them leads to under each other (:class:`sb3_htr.pearl.task_belief.KnownTasks`).
 
     :param latent_dim: dimension of z
-    :param plan_size: largest length of the search plan
+    :param max_known_tasks: largest number of known tasks
     :param aggregate_scale: standard deviations of the aggregate are multiplied by this, so that exploration reaches beyond
         what was visited so far. 1.5 by measurement: at 1.0 the search of the Point Robot stops growing early
     """
 
     mean: th.Tensor
     cholesky: th.Tensor
-    plan: th.Tensor
-    plan_length: th.Tensor
-    plan_n_tasks: th.Tensor
+    known_z: th.Tensor
+    known_returns: th.Tensor
+    known_first_success: th.Tensor
+    n_known_tasks: th.Tensor
 
-    def __init__(self, latent_dim: int, plan_size: int = 32, aggregate_scale: float = 1.5) -> None:
+    def __init__(self, latent_dim: int, max_known_tasks: int = 128, aggregate_scale: float = 1.5) -> None:
         super().__init__()
         self.latent_dim = latent_dim
         self.aggregate_scale = aggregate_scale
         self.register_buffer("mean", th.zeros(latent_dim))
         self.register_buffer("cholesky", th.eye(latent_dim))
-        self.register_buffer("plan", th.zeros(plan_size, latent_dim))
-        self.register_buffer("plan_length", th.zeros((), dtype=th.int64))
-        self.register_buffer("plan_n_tasks", th.zeros((), dtype=th.int64))
+        self.register_buffer("known_z", th.zeros(max_known_tasks, latent_dim))
+        self.register_buffer("known_returns", th.zeros(max_known_tasks, max_known_tasks))
+        self.register_buffer("known_first_success", th.zeros(max_known_tasks, max_known_tasks))
+        self.register_buffer("n_known_tasks", th.zeros((), dtype=th.int64))
 
     @property
-    def plan_size(self) -> int:
-        """Largest length of the search plan."""
-        return len(self.plan)
+    def max_known_tasks(self) -> int:
+        """Largest number of known tasks."""
+        return len(self.known_z)
 
     def set_aggregate(self, means: th.Tensor) -> None:
         """
@@ -75,26 +80,32 @@ class LatentPrior(nn.Module):
         jitter = 1e-6 * th.eye(self.latent_dim, device=means.device)
         self.cholesky.copy_(th.linalg.cholesky(centred.T @ centred / len(means) + jitter))
 
-    def set_plan(self, plan: th.Tensor, n_tasks: int) -> None:
+    def set_known_tasks(self, known: KnownTasks) -> None:
         """
-        :param plan: (n, latent_dim), n at most ``plan_size``
-        :param n_tasks: number of training tasks that it covers
+        :param known: at most ``max_known_tasks`` tasks
         """
-        self.plan[: len(plan)] = plan
-        self.plan_length.fill_(len(plan))
-        self.plan_n_tasks.fill_(n_tasks)
+        n = len(known.z)
+        self.known_z[:n] = th.as_tensor(known.z)
+        self.known_returns[:n, :n] = th.as_tensor(known.returns)
+        self.known_first_success[:n, :n] = th.as_tensor(known.first_success)
+        self.n_known_tasks.fill_(n)
 
-    def sample(self, explorer: Explorer, attempt: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:
+    def known_tasks(self) -> KnownTasks:
         """
-        :param explorer: how to draw; without a plan, SEARCH draws as AGGREGATE
-        :param attempt: (n,) int64, number of exploration episodes that were made before
+        :return: the known tasks
+        """
+        n = int(self.n_known_tasks)
+        arrays = (self.known_z[:n], self.known_returns[:n, :n], self.known_first_success[:n, :n])
+        return KnownTasks(*(array.cpu().numpy() for array in arrays))
+
+    def sample(self, explorer: Explorer, n: int, generator: th.Generator | None = None) -> th.Tensor:
+        """
+        :param explorer: PRIOR draws from N(0, I), the others from the aggregate
+        :param n: number of draws
         :param generator: source of randomness
         :return: (n, latent_dim)
         """
-        device = self.mean.device
-        noise = th.randn(len(attempt), self.latent_dim, generator=generator).to(device)
+        noise = th.randn(n, self.latent_dim, generator=generator).to(self.mean.device)
         if explorer is Explorer.PRIOR:
             return noise
-        if explorer is Explorer.SEARCH and self.plan_length > 0:
-            return self.plan[attempt.to(device) % self.plan_length]
         return self.mean + self.aggregate_scale * noise @ self.cholesky.T

@@ -30,6 +30,7 @@ from sb3_htr.pearl.exploration import to_explorer
 from sb3_htr.pearl.policies import LatentCritic, MlpPolicy, PEARLPolicy
 from sb3_htr.pearl.rollout import collect_adaptations
 from sb3_htr.pearl.task_bank import TaskBank
+from sb3_htr.pearl.task_belief import KnownTasks
 
 SelfPEARL = TypeVar("SelfPEARL", bound="PEARL")
 
@@ -255,6 +256,10 @@ class PEARL(SAC):
             progress_bar=progress_bar,
         )
 
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        # The last rollout may go beyond the budget, and a schedule must not go below its end
+        super()._update_current_progress_remaining(min(num_timesteps, total_timesteps), total_timesteps)
+
     def collect_rollouts(  # type: ignore[override]
         self,
         env: VecEnv,
@@ -366,7 +371,7 @@ class PEARL(SAC):
                     "q_value": q.detach().mean(),
                     "relabelled_fraction": relabelled.float().mean(),
                     "rl_reward_mean": data.rewards.mean(),
-                    "rl_zero_reward_fraction": (data.rewards == 0).all(dim=1).float().mean(),
+                    "rl_zero_reward_fraction": th.as_tensor(data.unrewarded, device=self.device).float().mean(),
                 }
             )
         for key in logs[0]:
@@ -380,16 +385,17 @@ class PEARL(SAC):
         assert self.replay_buffer is not None and self.task_bank is not None
         prior = self.policy.latent_prior
         prior.set_aggregate(means)
-        n_solved = len(self.task_bank.solved)
-        # A loaded model's plan is kept until this training knows as many tasks as it was made of
-        if n_solved >= max(int(prior.plan_n_tasks), 1):
-            context, mask = self.task_bank.search_plan(self.replay_buffer, prior.plan_size)
+        n_solved = min(len(self.task_bank.solved), prior.max_known_tasks)
+        # A loaded model's known tasks are kept until this training knows as many
+        if n_solved >= max(int(prior.n_known_tasks), 1):
+            best = self.task_bank.best_episodes(self.replay_buffer, prior.max_known_tasks)
+            context, mask, returns, first_success = best
             if self._vec_normalize_env is not None:
                 obs = slice(0, self.replay_buffer.obs_dim)
                 context[..., obs] = self._vec_normalize_env.normalize_obs(context[..., obs])
             with th.no_grad():
-                plan, _ = self.encoder(th.as_tensor(context, device=self.device), th.as_tensor(mask, device=self.device))
-            prior.set_plan(plan, n_solved)
+                z, _ = self.encoder(th.as_tensor(context, device=self.device), th.as_tensor(mask, device=self.device))
+            prior.set_known_tasks(KnownTasks(z.cpu().numpy(), returns, first_success))
 
     def start_adaptation(
         self,

@@ -1,12 +1,10 @@
-"""The best episode known for each training task, and the search plan made of them."""
+"""The best episode known for each training task."""
 
 import numpy as np
 
 from sb3_htr.common.type_aliases import TaskFamily
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 
-# Chance that an episode finds a task that it should find. Below 1, the plan comes back to places where it has been.
-DETECTION_PROBABILITY = 0.8
 # Episodes rewarded under all training tasks at a time, to bound memory
 CHUNK = 256
 
@@ -39,12 +37,10 @@ class TaskBank:
     def _update(self, buffer: MultiTaskReplayBuffer, episodes: np.ndarray, length: np.ndarray) -> None:
         if self.episodes.size == 0:
             self.episodes = np.zeros((len(self.length), *episodes.shape[1:]), dtype=np.float32)
-        traj = buffer.trajectory(episodes[:, None])
-        reward = self.task_family.compute_reward(traj, self.task_family.train_tasks) - traj.task_free_reward
         valid = np.arange(episodes.shape[1]) < length[:, None]
-        returns = (reward * valid[:, None]).sum(axis=-1)
+        _, returns = self._outcome(buffer, episodes, valid, self.task_family.train_tasks)
         best = returns.argmax(axis=0)
-        # A little more, because the rewards are a difference of float32
+        # A little more, because of rounding
         better = np.flatnonzero(returns.max(axis=0) > self.best_return + 1e-5)
         self.best_return[better] = returns[best[better], better]
         self.length[better] = length[best[better]]
@@ -55,33 +51,32 @@ class TaskBank:
         """(n_solved,) int, the training tasks that some episode would have solved."""
         return np.flatnonzero(self.length)
 
-    def search_plan(self, buffer: MultiTaskReplayBuffer, size: int) -> tuple[np.ndarray, np.ndarray]:
+    def best_episodes(self, buffer: MultiTaskReplayBuffer, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """
-        Order training tasks such that visiting them in this order finds an unknown task soon.
-
-        A greedy search under the belief that the unknown task is like one of the solved training tasks: each visit goes where
-        most belief is found, and thereafter the belief in what it should have found shrinks.
+        What an unknown task may be like: the solved training tasks, each with its best episode.
 
         :param buffer: names the columns of the episodes
-        :param size: largest number of visits
-        :return: contexts (n, T, obs_dim + action_dim + 1) of the visited tasks, rows (o, a, r), and their mask (n, T)
+        :param size: largest number of tasks; of more, evenly spread ones are taken
+        :return: contexts (n, T, obs_dim + action_dim + 1), rows (o, a, r); their mask (n, T); and of episode i under task j
+            the return without the task-free part (n, n) and the number of steps before the first success (n, n), infinite
+            without one
         """
         solved = self.solved
+        solved = solved[np.linspace(0, len(solved) - 1, min(size, len(solved))).round().astype(np.int64)]
         episodes, tasks = self.episodes[solved], self.task_family.train_tasks[solved]
         valid = np.arange(episodes.shape[1]) < self.length[solved, None]
-        success = self.task_family.is_success(buffer.trajectory(episodes[:, None]), tasks)
-        finds = np.any(success & valid[:, None], axis=-1)
-        # Among equals, the task that its own episode solves best: its z is the most certain
-        preference = 1e-6 * self.best_return[solved] / self.best_return.max(initial=1e-9)
-        # A task that few others resemble stands for more of the task space than one of many alike
-        belief = 1 / np.maximum(finds.sum(axis=0), 1)
-        order: list[int] = []
-        for _ in range(min(size, len(solved))):
-            gain = finds @ belief + preference
-            gain[order] = -np.inf
-            order.append(int(gain.argmax()))
-            belief[finds[order[-1]]] *= 1 - DETECTION_PROBABILITY
-        context = episodes[order, :, : buffer.context_dim]
-        traj = buffer.trajectory(episodes[order])
-        context[..., -1] = self.task_family.compute_reward(traj, tasks[order])
-        return context, valid[order].astype(np.float32)
+        context = episodes[..., : buffer.context_dim].copy()
+        context[..., -1] = self.task_family.compute_reward(buffer.trajectory(episodes), tasks)
+        success, returns = self._outcome(buffer, episodes, valid, tasks)
+        first_success = np.where(success.any(axis=-1), success.argmax(axis=-1), np.inf)
+        return context, valid.astype(np.float32), returns, first_success.astype(np.float32)
+
+    def _outcome(
+        self, buffer: MultiTaskReplayBuffer, episodes: np.ndarray, valid: np.ndarray, tasks: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Successes (n, m, T) and returns without the task-free part (n, m) of n episodes under m tasks."""
+        traj = buffer.trajectory(episodes[:, None])
+        success = self.task_family.is_success(traj, tasks) & valid[:, None]
+        reward = self.task_family.compute_reward(traj, tasks) - traj.task_free_reward
+        # 0 or clearly more: the reward without the task-free part is a difference of float32
+        return success, np.where(success, reward, 0.0).sum(axis=-1, dtype=np.float32)

@@ -13,13 +13,14 @@ import gymnasium as gym
 import rl_zoo3.train
 from rl_zoo3 import exp_manager
 from rl_zoo3.exp_manager import ExperimentManager
-from rl_zoo3.utils import ALGOS
+from rl_zoo3.utils import ALGOS, SimpleLinearSchedule
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr import PEARL
-from sb3_htr.common.callbacks import MetaEvalCallback, MetaTrialEvalCallback
+from sb3_htr.common.callbacks import MetaEvalCallback, MetaTrialEvalCallback, ProgressCallback
 from sb3_htr.common.checkpoint import CheckpointCallback, atomic_path
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr import EpisodeClustering
@@ -43,6 +44,15 @@ class MetaExperimentManager(ExperimentManager):
             self.eval_env_kwargs = dict(self.env_kwargs)
         return processed
 
+    @staticmethod
+    def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:
+        processed = ExperimentManager._preprocess_schedules(hyperparams)
+        for key, value in processed.items():
+            if isinstance(value, SimpleLinearSchedule):
+                # SB3's own schedule is the same, and a model with it can be loaded where rl_zoo3 is not installed
+                processed[key] = LinearSchedule(value.initial_value, 0.0, 1.0)
+        return processed
+
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         """
         :param n_envs: number of envs
@@ -63,6 +73,11 @@ class MetaExperimentManager(ExperimentManager):
         if self.vec_env_wrapper is not None:
             env = self.vec_env_wrapper(env)
         return self._maybe_normalize(env, eval_env)
+
+    def create_callbacks(self) -> None:
+        """Add the log of training, ``progress.csv``."""
+        super().create_callbacks()
+        self.callbacks.append(ProgressCallback(Path(self.save_path) / "progress.csv"))
 
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
         super()._save_config(saved_hyperparams)

@@ -1,0 +1,275 @@
+"""Sparse Target Speed: find and hold an unknown speed, in whatever direction."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+
+from htr_envs.rendering import draw_target_speed
+from htr_envs.task_env import BoolArray, FloatArray, TaskEnv, TaskFamily, Trajectory, at_step, check_reward_type
+from htr_envs.task_vector_env import TaskVectorEnv
+
+FRICTION = np.float32(0.95)
+THRUST = np.float32(0.2)
+CONTROL_COST = np.float32(0.01)
+# What full thrust along one axis would reach in the end
+TOP_SPEED = 4.0
+RENDER_MODES = ("rgb_array",)
+
+
+def _push(velocities: FloatArray, actions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    thrust = np.clip(actions, -1.0, 1.0)
+    # full thrust from the bound leads back to it but for rounding, and the observation's bounds must hold
+    pushed: FloatArray = np.clip(FRICTION * velocities + THRUST * thrust, -TOP_SPEED, TOP_SPEED)
+    return pushed, -CONTROL_COST * (thrust[..., 0] ** 2 + thrust[..., 1] ** 2)
+
+
+def _observation_space() -> spaces.Box:
+    return spaces.Box(-TOP_SPEED, TOP_SPEED, (2,), np.float32)
+
+
+def _action_space() -> spaces.Box:
+    return spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+
+class TargetSpeedFamily(TaskFamily):
+    """Speeds to hold, worth 1 for each step within the tolerance and 0 outside.
+
+    A task is one number, and all velocities of that speed solve it: it is no place to be, neither on the plane nor among the
+    velocities.
+
+    :param min_speed: smallest target speed, above 0.
+    :param max_speed: largest target speed, at most 4.
+    :param tolerance: a speed is held where the difference to it is smaller than this.
+    :param n_train_tasks: how many training tasks.
+    :param n_test_tasks: how many test tasks.
+    :param n_validation_tasks: how many validation tasks.
+    :param task_seed: seed of the task sets.
+    :raises ValueError: if a number is out of range.
+    """
+
+    def __init__(
+        self,
+        min_speed: float = 1.5,
+        max_speed: float = 3.0,
+        tolerance: float = 0.1,
+        n_train_tasks: int = 80,
+        n_test_tasks: int = 20,
+        n_validation_tasks: int = 20,
+        task_seed: int = 1337,
+    ) -> None:
+        if not 0.0 < min_speed < max_speed <= TOP_SPEED:
+            raise ValueError(
+                f"min_speed, max_speed are {min_speed}, {max_speed}, expected 0 < min_speed < max_speed <= {TOP_SPEED}."
+            )
+        if not tolerance > 0.0:
+            raise ValueError(f"tolerance is {tolerance}, expected a number above 0.")
+        if min(n_train_tasks, n_test_tasks, n_validation_tasks) < 1:
+            raise ValueError(
+                f"n_train_tasks, n_test_tasks, n_validation_tasks are {n_train_tasks}, {n_test_tasks}, {n_validation_tasks}: "
+                "each must be at least 1."
+            )
+        self.min_speed = float(min_speed)
+        self.max_speed = float(max_speed)
+        self.tolerance = float(tolerance)
+        # numpy never changes RandomState's stream, as it may Generator's: the tasks stay the same for good
+        random_state = np.random.RandomState(task_seed)
+        speeds = np.linspace(min_speed, max_speed, n_train_tasks + n_test_tasks)[:, None]
+        random_state.shuffle(speeds)
+        super().__init__(
+            # the corner of the box of velocities, rounded up
+            task_space=spaces.Box(0.0, np.float32(1.5 * TOP_SPEED), (1,), np.float32),
+            train_tasks=speeds[:n_train_tasks],
+            validation_tasks=random_state.uniform(min_speed, max_speed, (n_validation_tasks, 1)),
+            test_tasks=speeds[n_train_tasks:],
+        )
+
+    def sample_tasks(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw speeds uniformly.
+
+        :param n: how many tasks.
+        :param rng: the only source of randomness.
+        :return: speeds, shape (n, 1).
+        """
+        return rng.uniform(self.min_speed, self.max_speed, (n, 1)).astype(np.float32)
+
+    def compute_reward(self, traj: Trajectory, task: ArrayLike, reward_type: str = "sparse") -> FloatArray:
+        """Speed reward plus task-free reward of every step.
+
+        :param traj: the steps, arrays of shape (..., T, dim).
+        :param task: the speed, shape (..., 1); its leading axes broadcast with those of ``traj``.
+        :param reward_type: ``"sparse"``: 1 where the speed is held. ``"dense"``: minus the difference to the speed.
+        :return: rewards, shape (..., T), float32.
+        :raises ValueError: if the reward type is unknown.
+        """
+        check_reward_type(reward_type)
+        task_reward = -self._error(traj, task) if reward_type == "dense" else self.is_success(traj, task)
+        return np.asarray(task_reward + traj.task_free_reward, dtype=np.float32)
+
+    def is_success(self, traj: Trajectory, task: ArrayLike) -> BoolArray:
+        """Whether the next state of every step has the speed.
+
+        :param traj: the steps, arrays of shape (..., T, dim).
+        :param task: the speed, shape (..., 1); its leading axes broadcast with those of ``traj``.
+        :return: successes, shape (..., T).
+        """
+        return np.asarray(self._error(traj, task) < np.float32(self.tolerance))
+
+    def hindsight_task(self, traj: Trajectory, index: ArrayLike) -> FloatArray:
+        """The speed after one step.
+
+        :param traj: the steps, arrays of shape (..., T, dim).
+        :param index: which step, an int or an int array that broadcasts with the leading axes of ``traj``.
+        :return: speeds, shape (..., 1), float32, sharing no memory with ``traj``.
+        """
+        return self._speed(at_step(traj.next_observations, index))[..., None]
+
+    @staticmethod
+    def _speed(velocity: FloatArray) -> FloatArray:
+        # not np.linalg.norm: its sum may be ordered by memory layout, and rewards must be the same bits for any batch shape
+        speed: FloatArray = np.sqrt(velocity[..., 0] ** 2 + velocity[..., 1] ** 2, dtype=np.float32)
+        return speed
+
+    def _error(self, traj: Trajectory, task: ArrayLike) -> FloatArray:
+        error: FloatArray = np.abs(self._speed(traj.next_observations) - np.asarray(task, dtype=np.float32)[..., None, 0])
+        return error
+
+
+class TargetSpeedEnv(TaskEnv):
+    """
+    ## Description
+
+    A sledge on a plane with friction must go at a speed that it is not told; the direction does not matter. The reward is zero
+    until the speed is right. Tasks of this kind are not about reaching a place: many states solve a task, and holding one
+    takes constant effort. It is the sparse counterpart of the target velocity families of meta-reinforcement learning, small
+    enough to train within minutes.
+
+    ## Action Space
+
+    The action is clipped to the box. The velocity becomes 0.95 times what it was plus 0.2 times the action.
+
+    | Num | Action          | Min | Max | Unit                      |
+    |-----|-----------------|-----|-----|---------------------------|
+    | 0   | thrust along x  | -1  | 1   | 0.2 units of speed a step |
+    | 1   | thrust along y  | -1  | 1   | 0.2 units of speed a step |
+
+    ## Observation Space
+
+    | Num | Observation      | Min | Max | Unit  |
+    |-----|------------------|-----|-----|-------|
+    | 0   | velocity along x | -4  | 4   | speed |
+    | 1   | velocity along y | -4  | 4   | speed |
+
+    Nothing in it tells the target speed.
+
+    ## Rewards
+
+    With `e` the absolute difference between the speed after the step and the target speed:
+
+    - `reward_type="sparse"`: `1` if `e < tolerance`, else `0`.
+    - `reward_type="dense"`: `-e`, the proxy reward of the oracle baseline.
+
+    Both plus the task-free reward, a control cost of 0.01 times the squared length of the clipped action.
+    `info["is_success"]` is `e < tolerance`.
+
+    ## Task distribution
+
+    A task is a speed between `min_speed` and `max_speed`. The train and test tasks are evenly spaced, shuffled by `task_seed`;
+    the validation tasks are drawn uniformly. `task_space` goes from 0 beyond the largest possible speed, because a hindsight
+    task is any speed that was reached. The family is our own, its numbers chosen such that undirected thrust does not get
+    there: a uniformly random policy holds its target at some step of 0.014 % of its episodes
+    (27 of 200,000 measured).
+
+    ## Starting State
+
+    The sledge rests.
+
+    ## Episode End
+
+    ### Termination
+
+    Never, not even at the target speed.
+
+    ### Truncation
+
+    After 40 steps.
+
+    ## Arguments
+
+    | Parameter            | Default    | Description                                                       |
+    |----------------------|------------|-------------------------------------------------------------------|
+    | `min_speed`          | `1.5`      | smallest target speed                                             |
+    | `max_speed`          | `3.0`      | largest target speed                                              |
+    | `tolerance`          | `0.1`      | difference to the target speed below which it is held             |
+    | `n_train_tasks`      | `80`       | number of training tasks                                          |
+    | `n_test_tasks`       | `20`       | number of test tasks                                              |
+    | `n_validation_tasks` | `20`       | number of validation tasks                                        |
+    | `task_seed`          | `1337`     | seed of the task sets, apart from the run's seed                  |
+    | `reward_type`        | `"sparse"` | reward of `step`, `"sparse"` or `"dense"`                         |
+    | `render_mode`        | `None`     | `"rgb_array"` for pictures of the plane of velocities             |
+
+    `reset(options={"task_id": i})` or `reset(options={"task": [speed]})` gives the env a task, which stays until it
+    is changed.
+
+    ## Version History
+
+    - v0: first version
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # type: ignore[misc]
+
+    def __init__(self, reward_type: str = "sparse", render_mode: str | None = None, **family_kwargs: Any) -> None:
+        if render_mode is not None and render_mode not in RENDER_MODES:
+            raise ValueError(f"render_mode is {render_mode!r}, but only 'rgb_array' exists: pass it or None.")
+        super().__init__(TargetSpeedFamily(**family_kwargs), reward_type)
+        self.observation_space = _observation_space()
+        self.action_space = _action_space()
+        self.render_mode = render_mode
+        self._path: list[FloatArray] = []
+
+    def _reset_state(self) -> FloatArray:
+        self._path = [np.zeros(2, dtype=np.float32)]
+        return self._path[0]
+
+    def _step_state(self, action: FloatArray) -> tuple[FloatArray, float, bool]:
+        velocity, cost = _push(self._path[-1], action)
+        self._path.append(velocity)
+        return velocity, float(cost), False
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Draw the plane of velocities, the target speed of the current episode and the velocities so far.
+
+        :return: picture (400, 400, 3), uint8; None without a render mode.
+        """
+        if self.render_mode is None:
+            return None
+        assert isinstance(self.task_family, TargetSpeedFamily)
+        return draw_target_speed(np.stack(self._path), float(self.task[0]), self.task_family.tolerance)
+
+
+class TargetSpeedVectorEnv(TaskVectorEnv):
+    """Many sledges that step together; see :class:`TargetSpeedEnv` for what they do.
+
+    :param num_envs: how many sledges.
+    :param max_episode_steps: steps after which an episode is truncated, None for never.
+    :param reward_type: reward of ``step``, ``"sparse"`` or ``"dense"``.
+    :param family_kwargs: arguments of :class:`TargetSpeedFamily`.
+    """
+
+    def __init__(
+        self, num_envs: int = 1, max_episode_steps: int | None = 40, reward_type: str = "sparse", **family_kwargs: Any
+    ) -> None:
+        family = TargetSpeedFamily(**family_kwargs)
+        super().__init__(family, num_envs, _observation_space(), _action_space(), max_episode_steps, reward_type)
+        self._velocities = np.zeros((num_envs, 2), dtype=np.float32)
+
+    def _reset_state(self, indices: NDArray[np.int64]) -> FloatArray:
+        self._velocities[indices] = 0.0
+        return self._velocities[indices]
+
+    def _step_state(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        self._velocities, cost = _push(self._velocities, actions)
+        return self._velocities, cost, np.zeros(self.num_envs, dtype=np.bool_)
