@@ -61,6 +61,11 @@ def test_a_hindsight_buffer_holds_the_rewards_of_its_task() -> None:
     assert hindsight == 1.0 > real
 
 
+def test_even_strategy_prefers_hindsight_buffers_with_few_episodes() -> None:
+    even, random = (filled(200, hindsight_task_strategy=name, exploratory_fraction=0.0) for name in ("even", "random"))
+    assert even.n_hindsight_buffers > 1.1 * random.n_hindsight_buffers
+
+
 @pytest.mark.parametrize("k", [0.0, 0.4, 1.0])
 def test_k_is_the_probability_of_a_hindsight_buffer(k: float) -> None:
     buffer = filled(relabel_probability=k)

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from htr_envs import PointRobotFamily, Trajectory
 from sb3_htr.common.type_aliases import MultiTaskSamples
 from sb3_htr.htr.episode_store import EpisodeStore
+from sb3_htr.htr.hindsight_task import HindsightTaskStrategy, choose_rare
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer, spread
 
 FAMILY = PointRobotFamily()
@@ -106,10 +107,17 @@ def test_a_time_limit_is_not_a_termination() -> None:
 # --- relabelling
 
 
-@given(st.integers(0, 2**20), st.sampled_from([(20,), (1, 7, 20)]), st.floats(0, 1))
-def test_every_reward_is_that_of_one_task_per_row(seed: int, lengths: tuple[int, ...], k: float) -> None:
+@given(
+    st.integers(0, 2**20),
+    st.sampled_from([(20,), (1, 7, 20)]),
+    st.floats(0, 1),
+    st.sampled_from(HindsightTaskStrategy),
+)
+def test_every_reward_is_that_of_one_task_per_row(
+    seed: int, lengths: tuple[int, ...], k: float, strategy: HindsightTaskStrategy
+) -> None:
     """Rows that are not relabelled keep the env's reward; relabelled ones carry the reward of one task that was reached."""
-    buffer = filled(seed, lengths=lengths, relabel_probability=k, seed=seed)
+    buffer = filled(seed, lengths=lengths, relabel_probability=k, seed=seed, hindsight_task_strategy=strategy)
     data = buffer.sample(8, meta_batch_size=16, context_size=20)
     assert all(np.asarray(x).dtype == np.float32 for x in data[:7])
     own = FAMILY.train_tasks[data.task_ids]
@@ -186,6 +194,43 @@ def test_final_strategy_takes_the_last_state() -> None:
     ends = {tuple(row) for row in buffer.episodes.rows[index.rows[index.episode_row[1:] - 1], 5:7]}
     reached = _context_traj(data).next_observations[data.context[..., -1].numpy() == 1]
     assert len(reached) >= 16 and {tuple(place) for place in reached} <= ends
+
+
+def hindsight_places(strategy: str) -> np.ndarray:
+    """(n, 2) hindsight tasks that are drawn from random walks, most of whose states are near the start."""
+    buffer = filled(n_episodes=60, relabel_probability=1.0, hindsight_task_strategy=strategy)
+    places = []
+    for _ in range(20):
+        data = buffer.sample(1, meta_batch_size=64, context_size=20)
+        row, step = np.nonzero(data.context[..., -1].numpy() == 1)  # at the goal itself the reward is 1 - 0
+        places.append(_context_traj(data).next_observations[row, step])
+    return np.concatenate(places)
+
+
+def test_even_strategy_draws_tasks_that_are_rarely_reached_more_often() -> None:
+    random, even = (np.linalg.norm(hindsight_places(strategy), axis=1) for strategy in ("random", "even"))
+    assert len(random) == len(even) == 20 * 64
+    far = np.quantile(random, 0.9)
+    assert (even > far).mean() > 0.25, "a tenth of all states is that far from the start"
+
+
+@given(st.lists(st.lists(st.floats(0.1, 100), min_size=3, max_size=3), min_size=1, max_size=5), st.integers(0, 99))
+def test_choose_rare_chooses_inversely_to_the_count(counts: list[list[float]], seed: int) -> None:
+    count = np.repeat(np.array(counts), 4000, axis=0)
+    chosen = choose_rare(count, np.random.default_rng(seed)).reshape(len(counts), 4000)
+    expected = (1 / np.array(counts)) / (1 / np.array(counts)).sum(axis=1, keepdims=True)
+    frequency = np.stack([np.bincount(row, minlength=3) for row in chosen]) / 4000
+    np.testing.assert_allclose(frequency, expected, atol=0.05)
+
+
+def test_unrewarded_rows_are_those_without_a_reward_of_their_task() -> None:
+    buffer = filled(relabel_probability=0.5)
+    data = buffer.sample(16, meta_batch_size=200)
+    np.testing.assert_array_equal(data.unrewarded, (data.rewards == 0).all(dim=1))
+    # A cost that no task has a part in hides nothing
+    buffer.episodes.rows[:, [buffer._reward, buffer._task_free_reward]] -= 0.25
+    costly = buffer.sample(16, meta_batch_size=200)
+    assert 0.2 < costly.unrewarded.mean() < 0.7 and (costly.rewards[costly.unrewarded] == -0.25).all()
 
 
 def test_dense_proxy_is_only_in_the_rl_batch() -> None:

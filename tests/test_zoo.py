@@ -93,6 +93,20 @@ def test_env_kwargs_of_the_yaml_reach_the_evaluation(tmp_path: Path) -> None:
     assert evaluations["successes"].all(axis=(0, 1))[0]
 
 
+def test_a_run_logs_its_progress_and_its_schedule_needs_no_zoo(tmp_path: Path) -> None:
+    arguments = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-n", "960", "--eval-freq", "-1", "--verbose", "0"]
+    env_kwargs = ["--env-kwargs", "max_episode_steps:10"]
+    assert main([*arguments, *env_kwargs, "-params", *SMALL, "learning_rate:'lin_1e-3'"]) == 0
+    run = tmp_path / "pearl" / f"{ENV_ID}_1"
+    progress = np.genfromtxt(run / "progress.csv", delimiter=",", names=True, deletechars="")
+    assert progress["time/total_timesteps"][-1] == 960 and (progress["rollout/ep_len_mean"] == 10).all()
+    trained = np.isfinite(progress["train/critic_loss"])
+    assert trained.sum() > 2 and (np.diff(progress["train/learning_rate"][trained]) < 0).all()
+    code = "import sys; sys.modules['rl_zoo3'] = None; from sb3_htr import PEARL; print(PEARL.load(sys.argv[1]).learning_rate)"
+    command = [sys.executable, "-W", "error", "-c", code, str(run / f"{ENV_ID}.zip")]
+    assert "0.001" in subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
 def test_episode_clustering_can_be_asked_for_by_name(tmp_path: Path) -> None:
     arguments = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-n", "240", "--eval-freq", "-1", "--verbose", "0"]
     assert main([*arguments, "-params", *SMALL, "replay_buffer_class:'EpisodeClustering'"]) == 0

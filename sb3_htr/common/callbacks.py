@@ -132,8 +132,10 @@ class ProgressCallback(BaseCallback):
         return True
 
     def _on_training_end(self) -> None:
-        self.logger.output_formats.remove(self._output)
-        self._output.close()
+        # rl_zoo3 may end the training of a callback a second time
+        if self._output in self.logger.output_formats:
+            self.logger.output_formats.remove(self._output)
+            self._output.close()
 
 
 class TrialResult(Protocol):
