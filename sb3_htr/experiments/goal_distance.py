@@ -44,14 +44,13 @@ def optimal_return(goal_distance: float, max_episode_steps: int) -> float:
     """
     :param goal_distance: argument of the env
     :param max_episode_steps: argument of the env
-    :return: mean return over the test tasks of going straight to the goal and staying there
+    :return: mean return over the test tasks of going to the goal as fast as possible and staying there
     """
     goals = PointRobotFamily(goal_distance=goal_distance).test_tasks.astype(np.float64)
     position, total = np.zeros_like(goals), np.zeros(len(goals))
     for _ in range(max_episode_steps):
-        # The largest step in the goal's direction; each axis is clipped on its own
-        offset = goals - position
-        position += offset * np.minimum(1, 0.1 / np.abs(offset).max(axis=1, initial=1e-9))[:, None]
+        # Each axis is clipped on its own, so this is at least as fast as the straight way
+        position += np.clip(goals - position, -0.1, 0.1)
         distance = np.linalg.norm(goals - position, axis=1)
         total += np.where(distance < 0.2, 1 - distance, 0)
     return float(total.mean())

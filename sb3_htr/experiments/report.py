@@ -21,6 +21,8 @@ from sb3_htr.common.checkpoint import atomic_path
 from sb3_htr.experiments.runner import LOGGED, Cell
 
 RESULTS = Path(__file__).parents[2] / "results"
+# Bootstrap samples
+REPS = 2000
 # Okabe and Ito's colours
 COLOURS = ["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999"]
 
@@ -28,17 +30,40 @@ COLOURS = ["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#9
 Plot = Callable[[dict[Cell, Path], Path], None]
 
 
-def iqm_interval(scores: np.ndarray, reps: int = 2000) -> tuple[float, float, float]:
+def iqm_interval(scores: np.ndarray) -> tuple[float, float, float]:
     """
     :param scores: (n_seeds,) one score per run
-    :param reps: bootstrap samples
     :return: interquartile mean over runs, and its 95 % stratified bootstrap interval
     """
     np.random.seed(0)  # rliable hands its random_state on to a library that has come to ignore it
     estimates, intervals = library.get_interval_estimates(
-        {"": scores[:, None]}, lambda x: np.array([metrics.aggregate_iqm(x)]), reps=reps
+        {"": scores[:, None]}, lambda x: np.array([metrics.aggregate_iqm(x)]), reps=REPS
     )
     return float(estimates[""][0]), float(intervals[""][0, 0]), float(intervals[""][1, 0])
+
+
+def iqm_difference(scores: np.ndarray, reference: np.ndarray) -> tuple[float, float, float]:
+    """
+    :param scores: (n_seeds,) one score per run
+    :param reference: (n_seeds,) the same of another method
+    :return: difference of the interquartile means over runs, and its 95 % stratified bootstrap interval
+    """
+    np.random.seed(0)
+    estimates, intervals = library.get_interval_estimates(
+        {"": (scores[:, None], reference[:, None])},
+        lambda x, y: np.array([metrics.aggregate_iqm(x) - metrics.aggregate_iqm(y)]),
+        reps=REPS,
+    )
+    return float(estimates[""][0]), float(intervals[""][0, 0]), float(intervals[""][1, 0])
+
+
+def loss_of_stability(curve: np.ndarray) -> float:
+    """
+    :param curve: (n_evaluations, n_tasks), returns on validation tasks during training
+    :return: how far the worst of the last three evaluations is below the best of all
+    """
+    means = curve.mean(axis=1)
+    return float(means.max() - means[-3:].min())
 
 
 def episodes_to_first_success(successes: np.ndarray) -> np.ndarray:
@@ -49,10 +74,11 @@ def episodes_to_first_success(successes: np.ndarray) -> np.ndarray:
     return np.where(successes.any(axis=1), successes.argmax(axis=1) + 1, successes.shape[1] + 1)
 
 
-METRICS: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {
-    "last_episode_return": lambda returns, successes: float(returns[:, -1].mean()),
-    "success_rate": lambda returns, successes: float(successes[:, -1].mean()),
-    "episodes_to_first_success": lambda returns, successes: float(episodes_to_first_success(successes).mean()),
+METRICS: dict[str, Callable[[Any, str], float]] = {
+    "last_episode_return": lambda raw, explorer: float(raw[f"returns_{explorer}"][:, -1].mean()),
+    "success_rate": lambda raw, explorer: float(raw[f"successes_{explorer}"][:, -1].mean()),
+    "episodes_to_first_success": lambda raw, explorer: float(episodes_to_first_success(raw[f"successes_{explorer}"]).mean()),
+    "loss_of_stability": lambda raw, explorer: loss_of_stability(raw["curve"]),
 }
 
 
@@ -62,33 +88,30 @@ def summarize(name: str, results: dict[Cell, Path]) -> dict[str, Any]:
     :param results: raw results of its cells
     :return: content of ``summary.json``
     """
-    groups: dict[tuple[str, str, str], list[Cell]] = {}
+    groups: dict[tuple[str, str], dict[str, list[Cell]]] = {}
     for cell in results:
-        groups.setdefault((cell.env_id, cell.method, str(cell.env_kwargs)), []).append(cell)
-    rows = []
-    for (env_id, method, _), cells in groups.items():
-        raw = [np.load(results[cell]) for cell in cells]
-        for explorer in cells[0].explorers:
-            for metric, function in METRICS.items():
-                scores = np.array([function(r[f"returns_{explorer}"], r[f"successes_{explorer}"]) for r in raw])
-                iqm, low, high = iqm_interval(scores)
-                rows.append(
-                    {
-                        "env": env_id,
-                        "method": method,
-                        "explorer": explorer,
-                        "hyperparams": cells[0].hyperparams,
-                        "env_kwargs": cells[0].env_kwargs,
-                        "metric": metric,
-                        "env_steps": cells[0].n_timesteps,
-                        "n_seeds": len(cells),
-                        "iqm": round(iqm, 3),
-                        "low": round(low, 3),
-                        "high": round(high, 3),
-                        **{key: round(float(np.mean([r[key] for r in raw])), 4) for key in LOGGED},
-                        "wall_s": round(float(np.mean([r["wall_s"] for r in raw])), 1),
-                    }
-                )
+        groups.setdefault((cell.env_id, str(cell.env_kwargs)), {}).setdefault(cell.method, []).append(cell)
+    rows, differences = [], []
+    for methods in groups.values():
+        reference: np.ndarray | None = None
+        for method, cells in methods.items():
+            raw = [np.load(results[cell]) for cell in cells]
+            about = {"env": cells[0].env_id, "env_kwargs": cells[0].env_kwargs, "method": method}
+            for explorer in cells[0].explorers:
+                for metric, function in METRICS.items():
+                    scores = np.array([function(r, explorer) for r in raw])
+                    settings = {"hyperparams": cells[0].hyperparams, "explorer": explorer, "metric": metric}
+                    budget = {"env_steps": cells[0].n_timesteps, "n_seeds": len(cells)}
+                    rows.append({**about, **settings, **budget, **_rounded(iqm_interval(scores))})
+            means = {key: round(float(np.mean([r[key] for r in raw])), 4) for key in (*LOGGED, "wall_s")}
+            for row in rows[-len(METRICS) * len(cells[0].explorers) :]:
+                row.update(means)
+            scores = np.array([METRICS["last_episode_return"](r, cells[0].explorers[0]) for r in raw])
+            if reference is None:
+                reference, first = scores, method
+            else:
+                difference = _rounded(iqm_difference(reference, scores))
+                differences.append({**about, "of": first, "metric": "last_episode_return", **difference})
     commits = sorted({str(np.load(path)["commit"]) for path in results.values()})
     return {
         "name": name,
@@ -97,7 +120,13 @@ def summarize(name: str, results: dict[Cell, Path]) -> dict[str, Any]:
         "date": date.today().isoformat(),
         "machine": f"{_processor()}, one thread per run, Python {platform.python_version()}",
         "rows": rows,
+        # first method minus this one
+        "differences": differences,
     }
+
+
+def _rounded(interval: tuple[float, float, float]) -> dict[str, float]:
+    return {key: round(value, 3) for key, value in zip(("iqm", "low", "high"), interval, strict=True)}
 
 
 def _processor() -> str:
@@ -182,6 +211,6 @@ def band(axes: plt.Axes, x: np.ndarray, scores: np.ndarray, colour: str, style: 
     :param style: of the line, matplotlib's
     :param label: for the legend
     """
-    points = np.array([iqm_interval(column, reps=500) for column in scores.T])
+    points = np.array([iqm_interval(column) for column in scores.T])
     axes.plot(x, points[:, 0], style, color=colour, label=label)
     axes.fill_between(x, points[:, 1], points[:, 2], color=colour, alpha=0.2, linewidth=0)

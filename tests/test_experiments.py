@@ -1,0 +1,65 @@
+"""From raw results to tables and pictures. The runs are made up; what is said of them must be true."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sb3_htr.experiments import goal_distance, point_robot, readme, relabelling, report, target_speed
+from sb3_htr.experiments.report import Plot, episodes_to_first_success, iqm_difference, iqm_interval, loss_of_stability
+from sb3_htr.experiments.runner import LOGGED, Cell
+
+EXPERIMENTS: dict[str, tuple[Callable[[int, int], list[Cell]], Plot]] = {
+    "point_robot": (point_robot.cells, report.plot_learning),
+    "relabelling": (relabelling.cells, relabelling.plot),
+    "goal_distance": (goal_distance.cells, goal_distance.plot),
+    "target_speed": (target_speed.cells, report.plot_learning),
+}
+
+
+def made_up(cells: list[Cell], folder: Path) -> dict[Cell, Path]:
+    """Every test task of a run returns the number of its seed in the last episode, and solves the task from the third on."""
+    results = {}
+    for cell in cells:
+        arrays = {"timesteps": np.arange(1, 5) * 1000, "curve": np.ones((4, 20)) * [[1], [5], [4], [4.5]], "wall_s": 1.0}
+        arrays |= {"commit": "abc", **{key: 0.5 for key in LOGGED}}
+        for explorer in cell.explorers:
+            arrays[f"returns_{explorer}"] = np.full((20, 6), float(cell.seed), dtype=np.float32)
+            arrays[f"successes_{explorer}"] = np.arange(6) >= np.full((20, 1), 2)
+        results[cell] = folder / f"{cell.name}.npz"
+        np.savez(results[cell], **arrays)
+    assert len({cell.name for cell in cells}) == len(cells), "two runs of one name would overwrite each other"
+    return results
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cells, plot = EXPERIMENTS[name]
+    monkeypatch.setattr(report, "RESULTS", tmp_path / "results")
+    monkeypatch.setattr(report, "REPS", 50)
+    folder = report.write(name, made_up(cells(3, 20_000), tmp_path), plot)
+    assert (folder / f"{name}.png").stat().st_size > 10_000
+    assert len(np.load(folder / "raw.npz").files) > 10
+    summary = json.loads((folder / "summary.json").read_text())
+    value = {"last_episode_return": 2.0, "success_rate": 1.0, "episodes_to_first_success": 3.0, "loss_of_stability": 1.0}
+    for row in summary["rows"]:
+        assert row["iqm"] == value[row["metric"]] and row["n_seeds"] == 3
+        assert row["low"] <= row["iqm"] <= row["high"]
+    assert all(difference["low"] <= 0 <= difference["high"] for difference in summary["differences"])
+    assert "| 2.00 [1.00, 3.00] | 1.00 [1.00, 1.00] | 3.00 [3.00, 3.00] |" in readme.table(summary)
+
+
+def test_statistics() -> None:
+    assert iqm_interval(np.array([0.0, 10, 10, 10, 100]))[0] == pytest.approx(10)
+    estimate, low, high = iqm_difference(np.array([11.0, 12, 13, 12, 12]), np.array([1.0, 2, 3, 2, 2]))
+    assert estimate == pytest.approx(10) and 8 <= low <= 10 <= high <= 12
+    assert loss_of_stability(np.array([[1.0], [9], [8], [5], [7]])) == 4
+    successes = np.array([[False, True, True], [False, False, False]])
+    assert episodes_to_first_success(successes).tolist() == [2, 4]
+
+
+def test_optimal_return_is_that_of_the_env() -> None:
+    assert goal_distance.optimal_return(1.0, 20) == pytest.approx(13.38, abs=0.05)
+    assert goal_distance.optimal_return(2.0, 40) > goal_distance.optimal_return(2.0, 30)
