@@ -3,7 +3,11 @@
 import inspect
 from pathlib import Path
 
-from htr_envs import PointRobotEnv
+import gymnasium
+import matplotlib.pyplot as plt
+import numpy as np
+
+from htr_envs import PointRobotEnv, TargetSpeedEnv
 
 HERE = Path(__file__).parent
 
@@ -18,6 +22,22 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "none"
 myst_heading_anchors = 3
 
+
+def picture(env_id: str, task: list[float], actions: np.ndarray) -> np.ndarray:
+    """The last frame of an episode."""
+    env = gymnasium.make(env_id, render_mode="rgb_array")
+    env.reset(options={"task": task})
+    for action in actions:
+        env.step(action)
+    return np.asarray(env.render())
+
+
 # Docstrings of envs are Markdown, as in gymnasium: envs.md includes this copy
 (HERE / "_build").mkdir(exist_ok=True)
-(HERE / "_build" / "point_robot.md").write_text(inspect.cleandoc(PointRobotEnv.__doc__ or ""))
+for name, env in {"point_robot": PointRobotEnv, "target_speed": TargetSpeedEnv}.items():
+    (HERE / "_build" / f"{name}.md").write_text(inspect.cleandoc(env.__doc__ or ""))
+# To the ring, then along it: the velocity is multiplied by 0.95 and gets 0.2 times the thrust
+angle = np.pi / 4 - 0.06 * np.arange(27)
+ring = 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+thrust = np.concatenate([np.full((14, 2), 0.69), (ring[1:] - 0.95 * ring[:-1]) / 0.2]).astype(np.float32)
+plt.imsave(HERE / "_build" / "target_speed.png", picture("SparseTargetSpeed-v0", [2.0], thrust))
