@@ -10,8 +10,8 @@ from conftest import ENV_ID
 
 from htr_envs import PointRobotFamily
 from sb3_htr import PEARL, evaluate_adaptation
+from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.callbacks import MetaEvalCallback, MetaTrialEvalCallback
-from sb3_htr.common.checkpoint import CheckpointCallback, atomic_path
 from sb3_htr.common.vec_env import make_task_vec_env
 
 MakePEARL = Callable[..., PEARL]
@@ -59,18 +59,6 @@ def test_a_trial_can_be_pruned(tiny_pearl: MakePEARL) -> None:
     model = tiny_pearl().learn(10 * ROLLOUT, callback=callback)
     assert callback.is_pruned and model.num_timesteps == 2 * 20 * 4
     assert [step for _, step in trial.reported] == [1, 2]
-
-
-def test_checkpoints_can_be_gone_on_from(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
-    model = tiny_pearl()
-    model.learn(5 * ROLLOUT, callback=CheckpointCallback(save_freq=60, save_path=str(tmp_path), keep=2))
-    kept = sorted((tmp_path / "checkpoints").iterdir(), key=lambda path: int(path.name.split("_")[0]))
-    assert [path.name for path in kept] == [f"{3 * ROLLOUT}_steps", f"{4 * ROLLOUT}_steps"]
-    loaded = PEARL.load(kept[-1] / "rl_model.zip", env=make_task_vec_env(ENV_ID, 4))
-    loaded.load_replay_buffer(kept[-1] / "replay_buffer.pkl")
-    assert loaded.replay_buffer is not None and loaded.replay_buffer.size() == 4 * ROLLOUT
-    loaded.learn(ROLLOUT, reset_num_timesteps=False)
-    assert loaded.num_timesteps == 5 * ROLLOUT
 
 
 def test_a_save_that_fails_leaves_the_old_model(tiny_pearl: MakePEARL, tmp_path: Path) -> None:

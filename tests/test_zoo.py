@@ -62,11 +62,11 @@ def test_evaluate_prints_a_table_and_draws_pictures(
         assert (run / picture).stat().st_size > 10_000
 
 
-def test_a_run_goes_on_from_a_checkpoint(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    checkpoint = next((runs / "pearl" / f"{ENV_ID}_1" / "checkpoints").iterdir()) / "rl_model.zip"
-    arguments = ["train", "--env", ENV_ID, "-f", str(runs / "more"), "-n", "240", "-i", str(checkpoint), "--eval-freq", "-1"]
+def test_a_model_is_trained_on(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = runs / "pearl" / f"{ENV_ID}_1" / f"{ENV_ID}.zip"
+    arguments = ["train", "--env", ENV_ID, "-f", str(runs / "more"), "-n", "240", "-i", str(model), "--eval-freq", "-1"]
     assert main([*arguments, "--verbose", "0", "-params", *SMALL]) == 0
-    assert "Loading replay buffer" in capsys.readouterr().out
+    assert "Loading pretrained agent" in capsys.readouterr().out
 
 
 def test_normalized_runs_are_evaluated_as_they_were_trained(tmp_path: Path) -> None:

@@ -5,11 +5,12 @@ from pathlib import Path
 from typing import Any, Protocol, cast
 
 import numpy as np
+import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.logger import CSVOutputFormat
 from stable_baselines3.common.vec_env import sync_envs_normalization
 
-from sb3_htr.common.checkpoint import atomic_path
+from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.evaluation import MetaLearner, record_adaptation
 
@@ -49,6 +50,26 @@ class MetaEvalCallback(EvalCallback):
         self.explorer = explorer
         self.returns: list[np.ndarray] = []
         self.successes: list[np.ndarray] = []
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: results so far
+        """
+        return {
+            "timesteps": list(self.evaluations_timesteps),
+            "returns": [th.from_numpy(returns) for returns in self.returns],
+            "successes": [th.from_numpy(successes) for successes in self.successes],
+            "best_mean_reward": float(self.best_mean_reward),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: of :meth:`state_dict`
+        """
+        self.evaluations_timesteps = list(state["timesteps"])
+        self.returns = [returns.numpy() for returns in state["returns"]]
+        self.successes = [successes.numpy() for successes in state["successes"]]
+        self.best_mean_reward = state["best_mean_reward"]
 
     def _init_callback(self) -> None:
         # SB3's warns where training and evaluation envs are of different types, which they may be here
@@ -123,9 +144,25 @@ class ProgressCallback(BaseCallback):
     def __init__(self, path: str | os.PathLike[str]) -> None:
         super().__init__()
         self.path = os.fspath(path)
+        self._written: dict[str, Any] = {"keys": [], "text": ""}
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: what was written so far
+        """
+        return {"keys": list(self._output.keys), "text": Path(self.path).read_text()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: of :meth:`state_dict`; to be set before the training starts
+        """
+        self._written = state
 
     def _on_training_start(self) -> None:
         self._output = CSVOutputFormat(self.path)
+        self._output.keys = list(self._written["keys"])
+        self._output.file.write(self._written["text"])
+        self._output.file.flush()
         self.logger.output_formats.append(self._output)
 
     def _on_step(self) -> bool:

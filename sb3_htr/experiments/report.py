@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from rliable import library, metrics
 
-from sb3_htr.common.checkpoint import atomic_path
+from sb3_htr.common.atomic import atomic_path
 from sb3_htr.experiments.runner import LOGGED, Cell
 
 RESULTS = Path(__file__).parents[2] / "results"

@@ -14,7 +14,7 @@ import numpy as np
 
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr import PEARL
-from sb3_htr.common.checkpoint import atomic_path
+from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.evaluation import evaluate_adaptation
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.zoo.evaluate import find_run

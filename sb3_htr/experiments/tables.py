@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from sb3_htr.common.checkpoint import atomic_path
+from sb3_htr.common.atomic import atomic_path
 from sb3_htr.experiments.report import RESULTS
 
 DOCUMENTS = (RESULTS.parent / "README.md", RESULTS.parent / "docs" / "results.md")

@@ -3,6 +3,7 @@
 from typing import Any, Protocol
 
 import numpy as np
+import torch as th
 
 from sb3_htr.htr.episode_store import EpisodeIndex
 from sb3_htr.htr.hindsight_task import choose_rare, select_step
@@ -121,6 +122,21 @@ class EpisodeClustering(MultiTaskReplayBuffer):
             "replay/n_hindsight_buffers": self.n_hindsight_buffers,
             "replay/hindsight_megabytes": self.hindsight_nbytes / 1e6,
         }
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: as that of the parent, and the tasks of the hindsight buffers
+        """
+        tasks = np.array(self._hindsight_tasks, dtype=np.float32)
+        return {**super().state_dict(), "hindsight_tasks": th.from_numpy(tasks)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: of :meth:`state_dict` of a buffer with the same settings
+        """
+        super().load_state_dict(state)
+        self._hindsight_tasks = list(state["hindsight_tasks"].numpy().copy())
+        self._buffer_of = {task.tobytes(): self.n_tasks + i for i, task in enumerate(self._hindsight_tasks)}
 
     def reset(self) -> None:
         """Remove all episodes."""

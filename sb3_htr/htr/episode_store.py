@@ -1,8 +1,9 @@
 """Whole episodes of all tasks in one contiguous array."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch as th
 
 
 class EpisodeIndex(NamedTuple):
@@ -105,6 +106,37 @@ class EpisodeStore:
     def forget_taken(self) -> None:
         """Let :meth:`take_new` return every stored episode again."""
         self._new = self._slots[: self._n_first_tasks][self._slots[: self._n_first_tasks] >= 0].tolist()
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: all episodes, for :meth:`load_state_dict`
+        """
+        arrays = {
+            "n_added": self.n_added,
+            "slots": self._slots[: self.n_tasks],
+            "lengths": self._lengths[: self._n_slots],
+            "data": self._data[: self._n_slots],
+            "new": np.array(self._new, dtype=np.int64),
+        }
+        return {**{name: th.tensor(array) for name, array in arrays.items()}, "capacity": th.tensor(len(self._data))}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: of :meth:`state_dict` of a store of the same shape
+        """
+        arrays = {name: tensor.cpu().numpy().copy() for name, tensor in state.items()}
+        if arrays["data"].shape[1:] != self._data.shape[1:] or arrays["slots"].shape[1] != self.episodes_per_task:
+            raise ValueError(
+                f"The saved episodes have {arrays['slots'].shape[1]} slots a task of shape {arrays['data'].shape[1:]}, this "
+                f"buffer has {self.episodes_per_task} of {self._data.shape[1:]}: use the settings that they were saved with."
+            )
+        self.n_added, self._slots = arrays["n_added"], arrays["slots"]
+        self._n_slots = len(arrays["data"])
+        free = int(arrays["capacity"]) - self._n_slots
+        self._lengths = np.pad(arrays["lengths"], (0, free))
+        self._data = np.pad(arrays["data"], ((0, free), (0, 0), (0, 0)))
+        self._new = arrays["new"].tolist()
+        self._index = None
 
     def _allocate(self) -> int:
         if self._n_slots == len(self._data):

@@ -8,6 +8,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_htr.common.random_state import get_generator_state, set_generator_state
 from sb3_htr.common.type_aliases import MultiTaskSamples, TaskFamily, Trajectory
 from sb3_htr.htr.episode_store import EpisodeIndex, EpisodeStore
 from sb3_htr.htr.hindsight_task import HindsightTaskStrategy, choose_rare, select_step, to_hindsight_task_strategy
@@ -237,6 +238,24 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         """Remove all episodes."""
         store = self.episodes
         self.episodes = EpisodeStore(self.n_tasks, store.episodes_per_task, store.episode_length, store.rows.shape[1])
+        self.discard_open_episodes()
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: all complete episodes and the random generators, for :meth:`load_state_dict`
+        """
+        return {
+            "episodes": self.episodes.state_dict(),
+            "random": [get_generator_state(generator) for generator in (self._rng, self._relabel_rng)],
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: of :meth:`state_dict` of a buffer with the same settings
+        """
+        self.episodes.load_state_dict(state["episodes"])
+        for generator, saved in zip((self._rng, self._relabel_rng), state["random"], strict=True):
+            set_generator_state(generator, saved)
         self.discard_open_episodes()
 
     def trajectory(self, rows: np.ndarray) -> Trajectory:

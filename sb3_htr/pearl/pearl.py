@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.sac import SAC
 
 from sb3_htr.common import checks
-from sb3_htr.common.checkpoint import atomic_path
+from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.evaluation import run_adaptation
 from sb3_htr.common.type_aliases import TaskFamily
 from sb3_htr.common.vec_env import make_task_vec_env

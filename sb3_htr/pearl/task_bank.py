@@ -1,6 +1,9 @@
 """The best episode known for each training task."""
 
+from typing import Any
+
 import numpy as np
+import torch as th
 
 from sb3_htr.common.type_aliases import TaskFamily
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
@@ -45,6 +48,21 @@ class TaskBank:
         self.best_return[better] = returns[best[better], better]
         self.length[better] = length[best[better]]
         self.episodes[better] = episodes[best[better]]
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: the best episodes, for :meth:`load_state_dict`
+        """
+        arrays = {"best_return": self.best_return, "length": self.length, "episodes": self.episodes}
+        return {name: th.tensor(array) for name, array in arrays.items()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: of :meth:`state_dict`
+        """
+        self.best_return, self.length, self.episodes = (
+            state[name].cpu().numpy().copy() for name in ("best_return", "length", "episodes")
+        )
 
     @property
     def solved(self) -> np.ndarray:

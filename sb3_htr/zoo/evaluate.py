@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr import PEARL
-from sb3_htr.common.checkpoint import atomic_path
+from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.evaluation import AdaptationRecord, record_adaptation
 from sb3_htr.common.vec_env import make_task_vec_env

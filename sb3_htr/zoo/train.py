@@ -1,8 +1,12 @@
 """``sb3-htr train``: rl_zoo3's training with PEARL in it, and with evaluations that adapt."""
 
+import argparse
 import json
+import signal
 import sys
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from datetime import datetime, timezone
 from importlib.metadata import version
 from pathlib import Path
@@ -14,16 +18,19 @@ import rl_zoo3.train
 from rl_zoo3 import exp_manager
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.utils import ALGOS, SimpleLinearSchedule
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr import PEARL
+from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.callbacks import MetaEvalCallback, MetaTrialEvalCallback, ProgressCallback
-from sb3_htr.common.checkpoint import CheckpointCallback, atomic_path
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr import EpisodeClustering
+from sb3_htr.pearl.checkpoint import CheckpointCallback, cut_monitor_files, load_latest
+from sb3_htr.zoo.evaluate import find_run
 from sb3_htr.zoo.hyperparams import hyperparams_file
 
 PACKAGES = ("sb3_htr", "stable_baselines3", "gymnasium", "rl_zoo3", "torch", "numpy", "mujoco")
@@ -35,6 +42,9 @@ class MetaExperimentManager(ExperimentManager):
     """
     rl_zoo3's manager, with task envs stepped as one batch and env arguments of the YAML that reach the evaluation too.
     """
+
+    # Folder of the run that goes on, None for a new one
+    resumed: Path | None = None
 
     def _preprocess_hyperparams(
         self, hyperparams: dict[str, Any]
@@ -74,12 +84,60 @@ class MetaExperimentManager(ExperimentManager):
             env = self.vec_env_wrapper(env)
         return self._maybe_normalize(env, eval_env)
 
+    def create_log_folder(self) -> None:
+        """Make the run's folder, or take the one of the run that goes on."""
+        if self.resumed is not None:
+            self.save_path = str(self.resumed)
+            self.params_path = f"{self.save_path}/{self.env_name}"
+            folder, self._checkpoint = load_latest(self.resumed)
+            cut_monitor_files(self.resumed, folder, self._checkpoint["monitor_files"])
+            print(f"Going on from {folder}")
+        super().create_log_folder()
+
     def create_callbacks(self) -> None:
         """Add the log of training, ``progress.csv``."""
         super().create_callbacks()
         self.callbacks.append(ProgressCallback(Path(self.save_path) / "progress.csv"))
+        self._checkpointing = next((call for call in self.callbacks if isinstance(call, CheckpointCallback)), None)
+        if self._checkpointing is not None:
+            self._checkpointing.companions = [call for call in self.callbacks if call is not self._checkpointing]
+
+    def learn(self, model: BaseAlgorithm) -> None:
+        """
+        Train, from the checkpoint on if a run is resumed. A first interrupt stops before the next rollout, a second at once.
+
+        :param model: as set up
+        """
+        assert isinstance(model, PEARL)
+        done = 0
+        if self.resumed is not None:
+            assert self._checkpointing is not None, "a run that has a checkpoint makes them"
+            self._checkpointing.restore(model, self._checkpoint)
+            done = model.num_timesteps
+        log_interval = {-1: 1}.get(self.log_interval, self.log_interval if self.log_interval > 0 else None)
+        with _soft_interrupt(self._checkpointing):
+            try:
+                model.learn(max(int(self.n_timesteps) - done, 0), self.callbacks, log_interval, reset_num_timesteps=not done)
+            except KeyboardInterrupt:
+                print(f"Interrupted at {model.num_timesteps} steps.")
+            finally:
+                unfinished = model.num_timesteps < self.n_timesteps
+                if self._checkpointing is not None and (unfinished or self._checkpointing.stopping):
+                    print(f"To go on: sb3-htr train --resume {self.save_path}")
+                assert model.env is not None
+                model.env.close()
 
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
+        if self.resumed is not None:
+            before = json.loads((self.resumed / "run.json").read_text())["hyperparams"]
+            now = json.loads(json.dumps(saved_hyperparams))
+            if before != now:
+                changed = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
+                raise ValueError(
+                    f"The hyperparameters {changed} have changed since {self.resumed} was begun: a run goes on with the "
+                    "settings that it has. Restore the YAML file, or begin a new run."
+                )
+            return
         super()._save_config(saved_hyperparams)
         run = {
             "env_id": self.env_name.gym_id,
@@ -88,6 +146,7 @@ class MetaExperimentManager(ExperimentManager):
             "seed": self.seed,
             "n_timesteps": self.n_timesteps,
             "command": " ".join(sys.argv),
+            "arguments": sys.argv[1:],
             "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
             "versions": {name: version(name) for name in PACKAGES if _is_installed(name)},
             "hyperparams": saved_hyperparams,
@@ -122,15 +181,52 @@ def register() -> None:
         vars(module).update(classes)
 
 
+@contextmanager
+def _soft_interrupt(checkpointing: CheckpointCallback | None) -> Iterator[None]:
+    """Let the first Ctrl-C end the training before the next rollout, with a checkpoint, and the second one at once."""
+    if checkpointing is None or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(signum: int, frame: Any) -> None:
+        signal.signal(signal.SIGINT, before)
+        print("Stopping after this rollout, with a checkpoint. Press Ctrl-C again to stop at once.")
+        checkpointing.stop()
+
+    before = signal.signal(signal.SIGINT, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _arguments(argv: Sequence[str]) -> tuple[list[str], Path | None]:
+    """Those for rl_zoo3, and the run to go on with."""
+    parser = argparse.ArgumentParser(prog="sb3-htr train", add_help=False, allow_abbrev=False)
+    parser.add_argument("--resume", type=Path)
+    args, rest = parser.parse_known_args(argv)
+    if args.resume is None:
+        # Later arguments win, so these are defaults. One thread: two runs on two cores must not fight for them.
+        defaults = ["--algo", "pearl", "-conf", str(hyperparams_file()), "--num-threads", "1", "--save-freq", "20000"]
+        return [*defaults, *rest], None
+    if rest:
+        raise ValueError(f"train --resume goes on with the run's own arguments: leave {' '.join(rest)} away.")
+    run = find_run(args.resume)
+    record = json.loads((run / "run.json").read_text())
+    return [*record["arguments"], "--seed", str(record["seed"])], run
+
+
 def main(argv: Sequence[str]) -> None:
     """
-    :param argv: arguments of rl_zoo3's train; the algorithm is PEARL, the YAML is this package's unless given
+    :param argv: arguments of rl_zoo3's train; the algorithm is PEARL, the YAML is this package's unless given. Or ``--resume``
+        and the folder of a run, which goes on from its latest checkpoint
     """
     register()
-    # Later arguments win, so these are defaults. One thread: two runs on two cores must not fight for them.
-    defaults = ["--algo", "pearl", "-conf", str(hyperparams_file()), "--num-threads", "1"]
-    arguments, sys.argv = sys.argv, ["sb3-htr train", *defaults, *argv]
+    arguments, run = _arguments(argv)
+    before, sys.argv = sys.argv, ["sb3-htr train", *arguments]
+    MetaExperimentManager.resumed = run
     try:
         rl_zoo3.train.train()
     finally:
-        sys.argv = arguments
+        sys.argv = before
+        MetaExperimentManager.resumed = None

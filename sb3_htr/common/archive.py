@@ -1,0 +1,78 @@
+"""Folders of plain data: never half written, damage is noticed, and reading one runs no code."""
+
+import hashlib
+import json
+import os
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch as th
+
+from sb3_htr.common.atomic import atomic_path
+
+FORMAT = 1
+STATE, MANIFEST = "state.pt", "manifest.json"
+PACKAGES = ("sb3_htr", "stable_baselines3", "torch", "numpy", "gymnasium")
+
+
+class DamagedArchive(ValueError):
+    """A folder that cannot be read, with the reason."""
+
+
+def write_archive(folder: str | os.PathLike[str], state: dict[str, Any]) -> None:
+    """
+    :param folder: to make; its files appear all at once or not at all
+    :param state: nested dicts, lists and tuples of tensors, numbers, strings, None
+    :raises OSError: if it cannot be written; nothing is left behind
+    """
+    with atomic_path(folder) as temporary:
+        temporary.mkdir()
+        th.save(state, temporary / STATE)
+        manifest = {
+            "format": FORMAT,
+            "versions": {package: _version(package) for package in PACKAGES},
+            "sha256": {STATE: _sha256(temporary / STATE)},
+        }
+        (temporary / MANIFEST).write_text(json.dumps(manifest, indent=1))
+
+
+def read_archive(folder: str | os.PathLike[str], device: th.device | str = "cpu") -> dict[str, Any]:
+    """
+    :param folder: of :func:`write_archive`
+    :param device: where tensors are put
+    :return: the state
+    :raises DamagedArchive: if it is incomplete, changed, or of another format
+    """
+    folder = Path(folder)
+    try:
+        manifest = json.loads((folder / MANIFEST).read_text())
+        found, expected = manifest["format"], manifest["sha256"][STATE]
+        writer = manifest["versions"]["sb3_htr"]
+    except (OSError, ValueError, KeyError, TypeError):
+        raise DamagedArchive(f"{folder} has no readable {MANIFEST}: it is damaged, or no checkpoint.") from None
+    if found != FORMAT:
+        raise DamagedArchive(f"{folder} has format {found}, expected {FORMAT}: read it with sb3_htr {writer}, which wrote it.")
+    try:
+        intact = _sha256(folder / STATE) == expected
+    except OSError:
+        intact = False
+    if not intact:
+        raise DamagedArchive(f"{folder / STATE} is missing or not what was written: the checkpoint is damaged.")
+    state: dict[str, Any] = th.load(folder / STATE, map_location=device, weights_only=True)
+    return state
+
+
+def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "unknown"

@@ -1,0 +1,51 @@
+"""The states of random generators as plain data."""
+
+import json
+import random
+from typing import Any
+
+import numpy as np
+import torch as th
+
+
+def get_generator_state(generator: np.random.Generator) -> str:
+    """
+    :param generator: any
+    :return: its state as JSON
+    """
+    return json.dumps(generator.bit_generator.state, default=lambda array: array.tolist())
+
+
+def set_generator_state(generator: np.random.Generator, state: str) -> None:
+    """
+    :param generator: of the same kind as the one that the state is from
+    :param state: of :func:`get_generator_state`
+    """
+    generator.bit_generator.state = json.loads(state)
+
+
+def get_global_state() -> dict[str, Any]:
+    """
+    :return: state of the global generators of python, numpy and torch
+    """
+    name, keys, position, has_gauss, cached = np.random.get_state(legacy=True)
+    version, internal, gauss = random.getstate()
+    return {
+        "python": [version, list(internal), gauss],
+        "numpy": [name, [int(key) for key in keys], position, has_gauss, cached],
+        "torch": th.get_rng_state(),
+        "cuda": th.cuda.get_rng_state_all() if th.cuda.is_available() else [],
+    }
+
+
+def set_global_state(state: dict[str, Any]) -> None:
+    """
+    :param state: of :func:`get_global_state`
+    """
+    version, internal, gauss = state["python"]
+    random.setstate((version, tuple(internal), gauss))
+    name, keys, position, has_gauss, cached = state["numpy"]
+    np.random.set_state((name, np.array(keys, dtype=np.uint32), position, has_gauss, cached))
+    th.set_rng_state(state["torch"].cpu())
+    if state["cuda"]:
+        th.cuda.set_rng_state_all([cuda.cpu() for cuda in state["cuda"]])

@@ -1,0 +1,187 @@
+"""Checkpoints from which a training goes on as if it had never stopped."""
+
+import shutil
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_htr.common.archive import DamagedArchive, read_archive, write_archive
+from sb3_htr.common.atomic import atomic_path
+from sb3_htr.pearl.state import get_random_state, get_training_state, set_random_state, set_training_state
+
+if TYPE_CHECKING:
+    from sb3_htr.pearl.pearl import PEARL
+
+# What is recorded but not written yet
+LOGGER_STATE = ("name_to_value", "name_to_count", "name_to_excluded")
+
+
+@runtime_checkable
+class HasState(Protocol):
+    """A callback that remembers something."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nested dicts and lists of tensors, numbers, strings."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over the result of ``state_dict``."""
+        ...
+
+
+def checkpoints(run: Path) -> list[Path]:
+    """
+    :param run: folder of a run
+    :return: its checkpoints, the latest first
+    """
+    folders = [path for path in (run / "checkpoints").glob("*_steps") if path.name.split("_")[0].isdigit()]
+    return sorted(folders, key=lambda path: int(path.name.split("_")[0]), reverse=True)
+
+
+def load_latest(run: Path, device: str = "cpu") -> tuple[Path, dict[str, Any]]:
+    """
+    :param run: folder of a run
+    :param device: where tensors are put
+    :return: the latest checkpoint that is whole, and its state; those that are not are warned of
+    :raises FileNotFoundError: if there is none
+    """
+    for folder in checkpoints(run):
+        try:
+            return folder, read_archive(folder, device)
+        except DamagedArchive as error:
+            warnings.warn(f"{error} The next older checkpoint is tried.", stacklevel=2)
+    raise FileNotFoundError(f"There is no checkpoint to go on from in {run / 'checkpoints'}: train again, with --save-freq.")
+
+
+def cut_monitor_files(run: Path, folder: Path, sizes: dict[str, int]) -> None:
+    """
+    Forget the episodes after a checkpoint. Those before it are kept in files that SB3 reads with the others.
+
+    :param run: folder of a run, whose envs are not made yet
+    :param folder: the checkpoint
+    :param sizes: of the monitor files when it was made
+    """
+    kept = f".until_{folder.name}.monitor.csv"
+    for path in run.glob("*.monitor.csv"):
+        if path.name.endswith(kept) or (".until_" in path.name and path.name in sizes):
+            continue
+        target = path.with_name(path.name.removesuffix(".monitor.csv") + kept)
+        # If it exists, this training has gone on from here before, and what is cut is already there
+        if path.name in sizes and not target.exists():
+            with atomic_path(target) as temporary:
+                temporary.write_bytes(path.read_bytes()[: sizes[path.name]])
+        path.unlink()
+
+
+class CheckpointCallback(BaseCallback):
+    """
+    Saves all that a training is, between rollouts, as ``<save_path>/checkpoints/<steps>_steps/``.
+
+    A disk that is full stops no training: the checkpoint is tried again before the next rollout.
+
+    :param save_freq: smallest number of calls (steps of the VecEnv) between two checkpoints
+    :param save_path: folder of the run
+    :param keep: number of checkpoints to keep, the latest ones
+    :param companions: callbacks of the same training; the state of those that have one is saved too
+    :param name_prefix: for SB3's signature, not used
+    :param verbose: 1 says where checkpoints are written
+    """
+
+    def __init__(
+        self,
+        save_freq: int,
+        save_path: str,
+        keep: int = 2,
+        companions: Sequence[BaseCallback] = (),
+        name_prefix: str = "",
+        verbose: int = 0,
+    ) -> None:
+        super().__init__(verbose)
+        self.save_freq = save_freq
+        self.run = Path(save_path)
+        self.keep = keep
+        self.companions = companions
+        self._last_calls = 0
+        self._pending: dict[str, Any] | None = None
+        self.stopping = self._stopped = False
+
+    def restore(self, model: "PEARL", state: dict[str, Any]) -> None:
+        """
+        Put a training that was just set up, with the same settings, where a checkpoint was.
+
+        :param model: to be trained by ``learn(remaining steps, reset_num_timesteps=False)`` with this callback
+        :param state: of :func:`load_latest`
+        """
+        set_training_state(model, state["training"])
+        self._restore_callbacks(state["callbacks"])
+        # Setting up the training makes a logger, and resets the envs, which draws random numbers
+        self._pending = state
+
+    def stop(self) -> None:
+        """Save a checkpoint before the next rollout, and end the training there."""
+        self.stopping = True
+
+    def _restore_callbacks(self, states: list[dict[str, Any]]) -> None:
+        for callback, state in zip((self, *self.companions), states, strict=True):
+            callback.n_calls = state["n_calls"]
+            if isinstance(callback, HasState):
+                callback.load_state_dict(state["state"])
+        self._last_calls = self.n_calls
+
+    def _monitor_files(self) -> dict[str, int]:
+        return {path.name: path.stat().st_size for path in self.run.glob("*.monitor.csv")}
+
+    def _on_training_start(self) -> None:
+        if self._pending is not None:
+            set_random_state(self._pearl, self._pending["random"])
+            for name in LOGGER_STATE:
+                getattr(self.logger, name).update(self._pending["logger"][name])
+            self._pending = None
+
+    @property
+    def _pearl(self) -> "PEARL":
+        return cast("PEARL", self.model)
+
+    def _on_step(self) -> bool:
+        return not self._stopped
+
+    def _on_rollout_start(self) -> None:
+        # A rollout begins with a reset of all envs, so nothing is lost by stopping just before it
+        if self.n_calls - self._last_calls < self.save_freq and not self.stopping:
+            return
+        folder = self.run / "checkpoints" / f"{self.num_timesteps}_steps"
+        try:
+            write_archive(folder, self._state())
+        except OSError as error:
+            warnings.warn(
+                f"The checkpoint {folder} could not be written ({error.strerror or error}). Training goes on, and tries again "
+                "before the next rollout.",
+                stacklevel=2,
+            )
+            return
+        self._last_calls = self.n_calls
+        self._stopped = self.stopping
+        if self.verbose > 0:
+            print(f"Checkpoint: {folder}")
+        for old in checkpoints(self.run)[self.keep :]:
+            shutil.rmtree(old)
+
+    def _state(self) -> dict[str, Any]:
+        return {
+            "training": get_training_state(self._pearl),
+            "random": get_random_state(self._pearl),
+            "logger": {name: _plain(getattr(self.logger, name)) for name in LOGGER_STATE},
+            "callbacks": [
+                {"n_calls": callback.n_calls, "state": callback.state_dict() if isinstance(callback, HasState) else None}
+                for callback in (self, *self.companions)
+            ],
+            "monitor_files": self._monitor_files(),
+        }
+
+
+def _plain(values: dict[str, Any]) -> dict[str, Any]:
+    return {key: value.item() if isinstance(value, np.generic) else value for key, value in values.items()}

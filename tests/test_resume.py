@@ -1,0 +1,255 @@
+"""Nothing is lost: killed, interrupted and damaged runs."""
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from conftest import ENV_ID
+from stable_baselines3.common.monitor import load_results
+
+from sb3_htr import PEARL
+from sb3_htr.common.archive import MANIFEST, STATE, DamagedArchive, read_archive, write_archive
+from sb3_htr.pearl.checkpoint import checkpoints, load_latest
+from sb3_htr.zoo.cli import main
+
+# Rollouts of 4 tasks x 3 episodes x 20 steps, 10 of them, a checkpoint after each
+STEPS = 2400
+SMALL = ["n_envs:4", "n_tasks_per_rollout:4", "n_episodes_per_task:3", "learning_starts:240", "gradient_steps:4"]
+NETS = ["meta_batch_size:8", "batch_size:4", "policy_kwargs:{'net_arch':[16],'encoder_arch':[16],'latent_dim':3}"]
+ARGUMENTS = ["train", "--env", ENV_ID, "-n", str(STEPS), "--seed", "3", "--eval-freq", "480", "--save-freq", "1"]
+# Near goals, so that there are rewards to compare
+TRAIN = [*ARGUMENTS, "--verbose", "0", "--env-kwargs", "goal_distance:0.4", "-params", *SMALL, *NETS]
+
+
+def parameters(run: Path) -> dict[str, th.Tensor]:
+    model = PEARL.load(run / f"{ENV_ID}.zip", device="cpu")
+    tensors = {f"policy.{name}": value for name, value in model.policy.state_dict().items()}
+    for name in ("actor.optimizer", "critic.optimizer", "encoder.optimizer"):
+        for i, state in model.get_parameters()[name]["state"].items():
+            tensors |= {f"{name}.{i}.{key}": value for key, value in state.items()}
+    return tensors
+
+
+def assert_same_run(run: Path, unbroken: Path) -> None:
+    ours, theirs = parameters(run), parameters(unbroken)
+    assert ours.keys() == theirs.keys()
+    for name in ours:
+        assert th.equal(ours[name], theirs[name]), name
+    a, b = np.load(run / "evaluations.npz"), np.load(unbroken / "evaluations.npz")
+    for name in b.files:
+        np.testing.assert_array_equal(a[name], b[name], err_msg=name)
+    progress = [np.genfromtxt(r / "progress.csv", delimiter=",", names=True, deletechars="") for r in (run, unbroken)]
+    assert progress[0].dtype.names is not None
+    for name in progress[0].dtype.names:
+        if name not in ("time/fps", "time/time_elapsed"):
+            np.testing.assert_array_equal(progress[0][name], progress[1][name], err_msg=name)
+    # The episodes of all monitor files together, each once
+    episodes = [load_results(str(r)).sort_values("t") for r in (run, unbroken)]
+    assert len(episodes[0]) == len(episodes[1]) == STEPS // 20
+    assert sorted(episodes[0]["r"]) == sorted(episodes[1]["r"])
+
+
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that nothing happened to."""
+    folder = tmp_path_factory.mktemp("unbroken")
+    assert main([*TRAIN, "-f", str(folder)]) == 0
+    return folder / "pearl" / f"{ENV_ID}_1"
+
+
+def cut_off(run: Path, folder: Path, steps: int) -> Path:
+    """A copy of a run as if it had been killed some time after its checkpoint of ``steps``."""
+    copy = folder / "cut" / "pearl" / f"{ENV_ID}_1"
+    shutil.copytree(run, copy)
+    (copy / f"{ENV_ID}.zip").unlink()
+    return copy
+
+
+def test_a_run_goes_on_exactly(unbroken: Path, tmp_path: Path) -> None:
+    """With all the files of the future still lying around."""
+    run = cut_off(unbroken, tmp_path, STEPS)
+    kept = checkpoints(run)
+    assert len(kept) == 2 and int(kept[0].name.split("_")[0]) < STEPS
+    for _ in range(2):
+        shutil.rmtree(checkpoints(run)[0])
+        if not checkpoints(run):
+            break
+        assert main(["train", "--resume", str(run)]) == 0
+        assert_same_run(run, unbroken)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ["replay_buffer_class:'EpisodeClustering'"],
+        ["normalize:{'norm_obs':True,'norm_reward':False}", "ent_coef:'auto'", "learning_rate:'lin_1e-3'"],
+        ["env_wrapper:'gymnasium.wrappers.RecordEpisodeStatistics'"],  # single envs instead of a batch
+    ],
+)
+def test_runs_of_all_kinds_go_on_exactly(settings: list[str], tmp_path: Path) -> None:
+    assert main([*TRAIN, *settings, "-f", str(tmp_path)]) == 0
+    run = tmp_path / "pearl" / f"{ENV_ID}_1"
+    copy = cut_off(run, tmp_path, STEPS)
+    assert main(["train", "--resume", str(copy)]) == 0
+    assert_same_run(copy, run)
+
+
+@pytest.mark.parametrize("n_kills", [4])
+def test_kills_at_random_moments_change_nothing(unbroken: Path, tmp_path: Path, n_kills: int) -> None:
+    """SIGKILL of a real process; ``--n-kills`` of the nightly run is higher."""
+    n_kills = int(os.environ.get("SB3_HTR_KILLS", n_kills))
+    moments = random.Random(n_kills)
+    command = [sys.executable, "-m", "sb3_htr.zoo.cli"]
+    run = tmp_path / "pearl" / f"{ENV_ID}_1"
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    kills = 0
+    while kills < n_kills:
+        again = bool(checkpoints(run))
+        if not again:
+            shutil.rmtree(tmp_path / "pearl", ignore_errors=True)
+        arguments = ["train", "--resume", str(run)] if again else [*TRAIN, "-f", str(tmp_path)]
+        process = subprocess.Popen(
+            [*command, *arguments], env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        # Training proper takes about a second after the imports, so wait for its first sign
+        before = {path.name for path in checkpoints(run)}
+        while process.poll() is None and {path.name for path in checkpoints(run)} == before:
+            time.sleep(0.005)
+        time.sleep(moments.uniform(0, 0.15))
+        process.kill()
+        if process.wait() == -signal.SIGKILL:
+            kills += 1
+        else:  # it was faster
+            shutil.rmtree(tmp_path / "pearl")
+    subprocess.run([*command, "train", "--resume", str(run)], env=environment, check=True, capture_output=True)
+    assert_same_run(run, unbroken)
+
+
+def test_an_interrupt_stops_with_a_checkpoint_and_says_how_to_go_on(unbroken: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-u", "-m", "sb3_htr.zoo.cli", *TRAIN, "-f", str(tmp_path)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    run = tmp_path / "pearl" / f"{ENV_ID}_1"
+    while process.poll() is None and not checkpoints(run):
+        time.sleep(0.005)
+    process.send_signal(signal.SIGINT)
+    output = process.communicate(timeout=60)[0]
+    assert process.returncode == 0, output
+    assert f"sb3-htr train --resume {run}" in output
+    assert "Press Ctrl-C again" in output
+    assert main(["train", "--resume", str(run)]) == 0
+    assert_same_run(run, unbroken)
+
+
+# --- damage
+
+
+def damage_truncate(folder: Path) -> None:
+    data = (folder / STATE).read_bytes()
+    (folder / STATE).write_bytes(data[: len(data) // 2])
+
+
+def damage_flip_a_bit(folder: Path) -> None:
+    data = bytearray((folder / STATE).read_bytes())
+    data[len(data) // 3] ^= 1
+    (folder / STATE).write_bytes(bytes(data))
+
+
+def damage_empty(folder: Path) -> None:
+    (folder / STATE).write_bytes(b"")
+
+
+def damage_remove_state(folder: Path) -> None:
+    (folder / STATE).unlink()
+
+
+def damage_remove_manifest(folder: Path) -> None:
+    (folder / MANIFEST).unlink()
+
+
+def damage_garble_manifest(folder: Path) -> None:
+    (folder / MANIFEST).write_text("{")
+
+
+def damage_foreign_version(folder: Path) -> None:
+    manifest = json.loads((folder / MANIFEST).read_text())
+    (folder / MANIFEST).write_text(json.dumps({**manifest, "format": 999}))
+
+
+DAMAGES = [value for name, value in globals().items() if name.startswith("damage_")]
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_checkpoint_gives_one_sentence_and_the_next_older_one_is_taken(
+    damage: Any, unbroken: Path, tmp_path: Path
+) -> None:
+    run = cut_off(unbroken, tmp_path, STEPS)
+    newest, older = checkpoints(run)
+    damage(newest)
+    with pytest.raises(DamagedArchive) as error:
+        read_archive(newest)
+    assert str(newest) in str(error.value) and len(str(error.value).split(". ")) == 1
+    with pytest.warns(UserWarning, match="next older checkpoint"):
+        assert load_latest(run)[0] == older
+    damage(older)
+    with warnings.catch_warnings(), pytest.raises(FileNotFoundError, match="no checkpoint to go on from"):
+        warnings.simplefilter("ignore")
+        load_latest(run)
+
+
+class Bomb:
+    """A pickle that runs code."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+
+    def __reduce__(self) -> Any:
+        return Path.touch, (self.file,)
+
+
+def test_reading_a_checkpoint_runs_no_code(tmp_path: Path) -> None:
+    fuse = tmp_path / "exploded"
+    write_archive(tmp_path / "1_steps", {"bomb": Bomb(fuse)})
+    with pytest.raises(Exception, match=r"(?i)weights.only"):
+        read_archive(tmp_path / "1_steps")
+    assert not fuse.exists()
+
+
+def test_a_full_disk_stops_no_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import sb3_htr.pearl.checkpoint as module
+
+    calls = []
+
+    def write(folder: Path, state: dict[str, Any]) -> None:
+        calls.append(folder)
+        if len(calls) in (2, 3):
+            raise OSError(28, "No space left on device")
+        write_archive(folder, state)
+
+    monkeypatch.setattr(module, "write_archive", write)
+    with pytest.warns(UserWarning, match="No space left on device.*Training goes on"):
+        assert main([*TRAIN, "-f", str(tmp_path)]) == 0
+    steps = [int(folder.name.split("_")[0]) for folder in calls]
+    assert np.diff(steps).tolist() == [240] * (len(steps) - 1), "the next rollout tries again"
+    assert len(checkpoints(tmp_path / "pearl" / f"{ENV_ID}_1")) == 2
+
+
+def test_changed_settings_and_extra_arguments_are_refused(unbroken: Path, tmp_path: Path) -> None:
+    run = cut_off(unbroken, tmp_path, STEPS)
+    with pytest.raises(ValueError, match=r"own arguments: leave -n 5 away"):
+        main(["train", "--resume", str(run), "-n", "5"])
+    record = json.loads((run / "run.json").read_text())
+    record["hyperparams"]["gamma"] = 0.5
+    (run / "run.json").write_text(json.dumps(record))
+    with pytest.raises(ValueError, match=r"hyperparameters \['gamma'\] have changed"):
+        main(["train", "--resume", str(run)])
