@@ -94,7 +94,7 @@ def test_a_run_goes_on_exactly(unbroken: Path, tmp_path: Path) -> None:
     [
         ["replay_buffer_class:'EpisodeClustering'"],
         ["normalize:{'norm_obs':True,'norm_reward':False}", "ent_coef:'auto'", "learning_rate:'lin_1e-3'"],
-        ["env_wrapper:'gymnasium.wrappers.RecordEpisodeStatistics'"],  # single envs instead of a batch
+        ["env_wrapper:'gymnasium.wrappers.OrderEnforcing'"],  # single envs instead of a batch
     ],
 )
 def test_runs_of_all_kinds_go_on_exactly(settings: list[str], tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_htr.common.archive import DamagedArchive, read_archive, write_archive
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.pearl.state import get_random_state, get_training_state, set_random_state, set_training_state
+from sb3_htr.pearl.state import get_env_state, get_training_state, set_env_state, set_training_state
 
 if TYPE_CHECKING:
     from sb3_htr.pearl.pearl import PEARL
@@ -137,7 +137,7 @@ class CheckpointCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         if self._pending is not None:
-            set_random_state(self._pearl, self._pending["random"])
+            set_env_state(self._pearl, self._pending["envs"])
             for name in LOGGER_STATE:
                 getattr(self.logger, name).update(self._pending["logger"][name])
             self._pending = None
@@ -173,7 +173,7 @@ class CheckpointCallback(BaseCallback):
     def _state(self) -> dict[str, Any]:
         return {
             "training": get_training_state(self._pearl),
-            "random": get_random_state(self._pearl),
+            "envs": get_env_state(self._pearl),
             "logger": {name: _plain(getattr(self.logger, name)) for name in LOGGER_STATE},
             "callbacks": [
                 {"n_calls": callback.n_calls, "state": callback.state_dict() if isinstance(callback, HasState) else None}

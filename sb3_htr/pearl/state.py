@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.common.random_state import get_generator_state, get_global_state, set_generator_state, set_global_state
 
@@ -21,16 +20,15 @@ def get_training_state(model: "PEARL") -> dict[str, Any]:
     :return: networks, optimizers, replay, statistics and random generators, for :func:`set_training_state`
     """
     assert model.replay_buffer is not None and model.task_bank is not None and model.env is not None
-    normalize = model.get_vec_normalize_env()
     return {
         "parameters": model.get_parameters(),
+        "log_ent_coef": None if model.log_ent_coef is None else model.log_ent_coef.detach(),
         "counters": {name: getattr(model, name) for name in COUNTERS},
         "task_queue": th.from_numpy(model._task_queue.copy()),
         "episode_infos": [{k: _tensor(v) for k, v in info.items()} for info in model.ep_info_buffer or ()],
         "episode_successes": [_tensor(success) for success in model.ep_success_buffer or ()],
         "replay": model.replay_buffer.state_dict(),
         "task_bank": model.task_bank.state_dict(),
-        "normalize": None if normalize is None else {k: _tensor(v) for k, v in vars(normalize.obs_rms).items()},
     }
 
 
@@ -41,6 +39,8 @@ def set_training_state(model: "PEARL", state: dict[str, Any]) -> None:
     """
     assert model.replay_buffer is not None and model.task_bank is not None
     model.set_parameters(state["parameters"], exact_match=True, device=model.device)
+    if model.log_ent_coef is not None:
+        model.log_ent_coef.data.copy_(state["log_ent_coef"])
     for name, value in state["counters"].items():
         setattr(model, name, value)
     model._task_queue = state["task_queue"].numpy().copy()
@@ -50,36 +50,38 @@ def set_training_state(model: "PEARL", state: dict[str, Any]) -> None:
     model.ep_success_buffer = deque(successes, maxlen=model._stats_window_size)
     model.replay_buffer.load_state_dict(state["replay"])
     model.task_bank.load_state_dict(state["task_bank"])
-    normalize = model.get_vec_normalize_env()
-    if normalize is not None:
-        for key, value in state["normalize"].items():
-            setattr(normalize.obs_rms, key, _number(value))
 
 
-def get_random_state(model: "PEARL") -> dict[str, Any]:
+def get_env_state(model: "PEARL") -> dict[str, Any]:
     """
     :param model: in training
-    :return: states of all random generators that its training draws from, those of the envs among them
+    :return: states of all random generators that its training draws from, those of the envs among them, and the statistics of
+        observations: all that the reset of the envs changes with which a training is set up
     """
-    assert model.env is not None and model.replay_buffer is not None
+    assert model.env is not None
+    normalize = model.get_vec_normalize_env()
     return {
         "global": get_global_state(),
         "model": get_generator_state(model._rng),
         "envs": [get_generator_state(generator) for generator in model.env.get_attr("np_random")],
+        "normalize": {} if normalize is None else {key: _tensor(value) for key, value in vars(normalize.obs_rms).items()},
     }
 
 
-def set_random_state(model: "PEARL", state: dict[str, Any]) -> None:
+def set_env_state(model: "PEARL", state: dict[str, Any]) -> None:
     """
     :param model: in training; its envs are not reset again before the next rollout
-    :param state: of :func:`get_random_state`
+    :param state: of :func:`get_env_state`
     """
-    assert isinstance(model.env, VecEnv)
+    assert model.env is not None
     set_global_state(state["global"])
     set_generator_state(model._rng, state["model"])
     for i, (generator, saved) in enumerate(zip(model.env.get_attr("np_random"), state["envs"], strict=True)):
         set_generator_state(generator, saved)
         model.env.set_attr("np_random", generator, indices=i)
+    normalize = model.get_vec_normalize_env()
+    for key, value in state["normalize"].items():
+        setattr(normalize.obs_rms, key, _number(value))  # type: ignore[union-attr]
 
 
 def _tensor(value: Any) -> th.Tensor:
