@@ -4,7 +4,7 @@ from pathlib import Path
 
 from sb3_htr.common.evaluation import evaluate_adaptation
 from sb3_htr.htr import MultiTaskReplayBuffer
-from sb3_htr.pearl import PEARL
+from sb3_htr.pearl import PEARL, load_untrusted
 
 __version__ = (Path(__file__).parent / "version.txt").read_text().strip()
-__all__ = ["PEARL", "MultiTaskReplayBuffer", "__version__", "evaluate_adaptation"]
+__all__ = ["PEARL", "MultiTaskReplayBuffer", "__version__", "evaluate_adaptation", "load_untrusted"]

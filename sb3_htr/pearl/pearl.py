@@ -1,9 +1,6 @@
 """PEARL with hindsight task relabelling."""
 
-import io
-import pathlib
 import warnings
-from collections.abc import Iterable
 from typing import Any, ClassVar, TypeVar, cast
 
 import gymnasium as gym
@@ -15,18 +12,18 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule, TrainFreq
 from stable_baselines3.common.vec_env import VecEnv
-from stable_baselines3.sac import SAC
 
 from sb3_htr.common import checks
-from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.evaluation import run_adaptation
 from sb3_htr.common.type_aliases import TaskFamily
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.pearl.adaptation import Adaptation
 from sb3_htr.pearl.adapted_agent import AdaptedAgent
+from sb3_htr.pearl.divergence import PosteriorWatch, check_finite
 from sb3_htr.pearl.encoder import ContextEncoder, kl_to_prior
 from sb3_htr.pearl.exploration import to_explorer
+from sb3_htr.pearl.files import SavesToFiles
 from sb3_htr.pearl.policies import LatentCritic, MlpPolicy, PEARLPolicy
 from sb3_htr.pearl.rollout import collect_adaptations
 from sb3_htr.pearl.task_bank import TaskBank
@@ -35,7 +32,7 @@ from sb3_htr.pearl.task_belief import KnownTasks
 SelfPEARL = TypeVar("SelfPEARL", bound="PEARL")
 
 
-class PEARL(SAC):
+class PEARL(SavesToFiles):
     """
     Probabilistic Embeddings for Actor-critic RL (PEARL), with Hindsight Task Relabelling (HTR) in its replay buffer.
 
@@ -173,6 +170,7 @@ class PEARL(SAC):
         self._task_queue = np.zeros(0, dtype=np.int64)
         self._n_rollouts = 0
         self._warned_not_adapted = False
+        self._posterior_watch = PosteriorWatch()
         if _init_setup_model:
             self._setup_model()
 
@@ -309,77 +307,83 @@ class PEARL(SAC):
         if self.ent_coef_optimizer is not None:
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
-        critic_parameters: list[th.Tensor] = list(self.critic.parameters())
-        target_parameters: list[th.Tensor] = list(self.critic_target.parameters())
-        means: list[th.Tensor] = []
-        logs: list[dict[str, th.Tensor]] = []
-        for _ in range(gradient_steps):
-            data = self.replay_buffer.sample(
-                batch_size,
-                env=self._vec_normalize_env,
-                meta_batch_size=self.meta_batch_size,
-                context_size=self.context_size,
-            )
-            # One backward pass through the encoder: it learns from the critics' errors and the KL term
-            mean, variance = self.encoder(data.context, data.context_mask)
-            z = mean + variance.sqrt() * th.randn_like(mean)
-            kl = kl_to_prior(mean, variance).mean()
-            z_rows = z.unsqueeze(1).expand(-1, batch_size, -1)
-            obs_z = th.cat([data.observations, z_rows], dim=-1).flatten(0, 1)
-            ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp()
-            with th.no_grad():
-                next_obs_z = th.cat([data.next_observations, z_rows], dim=-1).flatten(0, 1)
-                next_actions, next_log_prob = self.actor.action_log_prob(next_obs_z)
-                next_q = self.critic_target(next_obs_z, next_actions).amin(dim=0) - ent_coef * next_log_prob
-                target_q = data.rewards.flatten() + (1 - data.dones.flatten()) * self.gamma * next_q
-            q = self.critic(obs_z, data.actions.flatten(0, 1))
-            critic_loss = (q - target_q).square().sum(dim=0).mean()
-            self.critic.optimizer.zero_grad()
-            self.encoder.optimizer.zero_grad()
-            (critic_loss + self.kl_coef * kl).backward()
-            self.critic.optimizer.step()
-            self.encoder.optimizer.step()
-
-            # The actor sees z, but does not shape it
-            obs_z = obs_z.detach()
-            actions_pi, log_prob = self.actor.action_log_prob(obs_z)
-            self.critic.requires_grad_(False)
-            actor_loss = (ent_coef * log_prob - self.critic(obs_z, actions_pi).amin(dim=0)).mean()
-            self.actor.optimizer.zero_grad()
-            actor_loss.backward()
-            self.actor.optimizer.step()
-            self.critic.requires_grad_(True)
-
-            if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
-                ent_coef_loss = -(self.log_ent_coef * (log_prob.detach().mean() + float(self.target_entropy))).mean()
-                self.ent_coef_optimizer.zero_grad()
-                ent_coef_loss.backward()
-                self.ent_coef_optimizer.step()
-            self._n_updates += 1
-            if self._n_updates % self.target_update_interval == 0:
-                with th.no_grad():
-                    th._foreach_lerp_(target_parameters, critic_parameters, self.tau)
-            means.append(mean.detach())
-            relabelled = th.as_tensor(data.relabelled, device=self.device)
-            logs.append(
-                {
-                    "critic_loss": critic_loss.detach(),
-                    "actor_loss": actor_loss.detach(),
-                    "kl_divergence": kl.detach(),
-                    "ent_coef": ent_coef.detach().mean(),
-                    "posterior_std": variance.detach().sqrt().mean(),
-                    "q_value": q.detach().mean(),
-                    "relabelled_fraction": relabelled.float().mean(),
-                    "rl_reward_mean": data.rewards.mean(),
-                    "rl_zero_reward_fraction": th.as_tensor(data.unrewarded, device=self.device).float().mean(),
-                }
-            )
-        for key in logs[0]:
-            self.logger.record(f"train/{key}", th.stack([log[key] for log in logs]).mean().item())
+        try:
+            means, logs = zip(*(self._update(batch_size) for _ in range(gradient_steps)), strict=True)
+        except ValueError:
+            # torch's distributions refuse what is not finite, in many lines
+            check_finite(self.policy, {}, self._n_updates, self.num_timesteps)
+            raise
+        log_means = {key: th.stack([log[key] for log in logs]).mean().item() for key in logs[0]}
+        check_finite(self.policy, log_means, self._n_updates, self.num_timesteps)
+        self._posterior_watch.check(log_means["kl_divergence"])
+        for key, value in log_means.items():
+            self.logger.record(f"train/{key}", value)
         for key, value in self.replay_buffer.stats().items():
             self.logger.record(key, value)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self._update_latent_prior(th.cat(means[-20:]))
+
+    def _update(self, batch_size: int) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+        """One update of all networks. Posterior means (M, latent_dim), and what to log."""
+        assert self.replay_buffer is not None
+        data = self.replay_buffer.sample(
+            batch_size,
+            env=self._vec_normalize_env,
+            meta_batch_size=self.meta_batch_size,
+            context_size=self.context_size,
+        )
+        # One backward pass through the encoder: it learns from the critics' errors and the KL term
+        mean, variance = self.encoder(data.context, data.context_mask)
+        z = mean + variance.sqrt() * th.randn_like(mean)
+        kl = kl_to_prior(mean, variance).mean()
+        z_rows = z.unsqueeze(1).expand(-1, batch_size, -1)
+        obs_z = th.cat([data.observations, z_rows], dim=-1).flatten(0, 1)
+        ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp()
+        with th.no_grad():
+            next_obs_z = th.cat([data.next_observations, z_rows], dim=-1).flatten(0, 1)
+            next_actions, next_log_prob = self.actor.action_log_prob(next_obs_z)
+            next_q = self.critic_target(next_obs_z, next_actions).amin(dim=0) - ent_coef * next_log_prob
+            target_q = data.rewards.flatten() + (1 - data.dones.flatten()) * self.gamma * next_q
+        q = self.critic(obs_z, data.actions.flatten(0, 1))
+        critic_loss = (q - target_q).square().sum(dim=0).mean()
+        self.critic.optimizer.zero_grad()
+        self.encoder.optimizer.zero_grad()
+        (critic_loss + self.kl_coef * kl).backward()
+        self.critic.optimizer.step()
+        self.encoder.optimizer.step()
+
+        # The actor sees z, but does not shape it
+        obs_z = obs_z.detach()
+        actions_pi, log_prob = self.actor.action_log_prob(obs_z)
+        self.critic.requires_grad_(False)
+        actor_loss = (ent_coef * log_prob - self.critic(obs_z, actions_pi).amin(dim=0)).mean()
+        self.actor.optimizer.zero_grad()
+        actor_loss.backward()
+        self.actor.optimizer.step()
+        self.critic.requires_grad_(True)
+
+        if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
+            ent_coef_loss = -(self.log_ent_coef * (log_prob.detach().mean() + float(self.target_entropy))).mean()
+            self.ent_coef_optimizer.zero_grad()
+            ent_coef_loss.backward()
+            self.ent_coef_optimizer.step()
+        self._n_updates += 1
+        if self._n_updates % self.target_update_interval == 0:
+            with th.no_grad():
+                th._foreach_lerp_(list(self.critic_target.parameters()), list(self.critic.parameters()), self.tau)
+        relabelled = th.as_tensor(data.relabelled, device=self.device)
+        log = {
+            "critic_loss": critic_loss.detach(),
+            "actor_loss": actor_loss.detach(),
+            "kl_divergence": kl.detach(),
+            "ent_coef": ent_coef.detach().mean(),
+            "posterior_std": variance.detach().sqrt().mean(),
+            "q_value": q.detach().mean(),
+            "relabelled_fraction": relabelled.float().mean(),
+            "rl_reward_mean": data.rewards.mean(),
+            "rl_zero_reward_fraction": th.as_tensor(data.unrewarded, device=self.device).float().mean(),
+        }
+        return mean.detach(), log
 
     def _update_latent_prior(self, means: th.Tensor) -> None:
         assert self.replay_buffer is not None and self.task_bank is not None
@@ -478,46 +482,8 @@ class PEARL(SAC):
             )
         return self.policy.predict(observation, state, episode_start, deterministic)
 
-    def save(
-        self,
-        path: str | pathlib.Path | io.BufferedIOBase,
-        exclude: Iterable[str] | None = None,
-        include: Iterable[str] | None = None,
-    ) -> None:
-        """
-        :param path: file, ``.zip`` is added to a name without suffix; it is replaced at the end or not at all
-        :param exclude: attributes to leave out
-        :param include: attributes to save that would be left out
-        """
-        if isinstance(path, io.IOBase):
-            return super().save(path, exclude, include)
-        path = pathlib.Path(path)
-        with atomic_path(path if path.suffix else path.with_suffix(".zip")) as temporary:
-            super().save(temporary, exclude, include)
-
-    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
-        """
-        :param path: file, ``.pkl`` is added to a name without suffix; it is replaced at the end or not at all
-        """
-        if isinstance(path, io.IOBase):
-            return super().save_replay_buffer(path)
-        path = pathlib.Path(path)
-        with atomic_path(path if path.suffix else path.with_suffix(".pkl")) as temporary:
-            super().save_replay_buffer(temporary)
-
-    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
-        """
-        :param path: file of ``save_replay_buffer``
-        :param truncate_last_traj: not used, only whole episodes are stored
-        """
-        super().load_replay_buffer(path, truncate_last_traj)
-        assert self.replay_buffer is not None
-        self.replay_buffer.episodes.forget_taken()
-        self.task_bank = TaskBank(self.replay_buffer.task_family)
-        self.task_bank.update(self.replay_buffer)
-
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "encoder", "task_bank"]
+        return [*super()._excluded_save_params(), "encoder", "task_bank", "_posterior_watch"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

@@ -29,7 +29,8 @@ from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.callbacks import MetaEvalCallback, MetaTrialEvalCallback, ProgressCallback
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr import EpisodeClustering
-from sb3_htr.pearl.checkpoint import CheckpointCallback, cut_monitor_files, load_latest
+from sb3_htr.pearl.checkpoint import CheckpointCallback, checkpoints, cut_monitor_files, load_latest
+from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.zoo.evaluate import find_run
 from sb3_htr.zoo.hyperparams import hyperparams_file
 
@@ -120,6 +121,9 @@ class MetaExperimentManager(ExperimentManager):
                 model.learn(max(int(self.n_timesteps) - done, 0), self.callbacks, log_interval, reset_num_timesteps=not done)
             except KeyboardInterrupt:
                 print(f"Interrupted at {model.num_timesteps} steps.")
+            except DivergedError as error:
+                last = next(iter(checkpoints(Path(self.save_path))), None)
+                raise DivergedError(f"{error} The last checkpoint is {last}.") from None
             finally:
                 unfinished = model.num_timesteps < self.n_timesteps
                 if self._checkpointing is not None and (unfinished or self._checkpointing.stopping):

@@ -1,0 +1,50 @@
+"""A training that goes wrong says so."""
+
+import warnings
+from collections.abc import Callable
+
+import pytest
+import torch as th
+
+from sb3_htr import PEARL
+from sb3_htr.pearl.divergence import DivergedError, PosteriorWatch
+
+MakePEARL = Callable[..., PEARL]
+ROLLOUT = 4 * 3 * 20
+
+
+def test_a_diverging_loss_stops_training_with_step_and_tensor(tiny_pearl: MakePEARL) -> None:
+    message = r"(critic_loss is (nan|inf)|not finite) at env step \d+, update \d+.*lower learning_rate"
+    with pytest.raises(DivergedError, match=message):
+        tiny_pearl(learning_rate=1e20, gradient_steps=30).learn(10 * ROLLOUT)
+
+
+@pytest.mark.parametrize("network", ["encoder", "critic", "actor"])
+def test_a_weight_that_is_not_finite_is_named(tiny_pearl: MakePEARL, network: str) -> None:
+    model = tiny_pearl().learn(2 * ROLLOUT)
+    name, weight = next(iter(getattr(model.policy, network).named_parameters()))
+    with th.no_grad():
+        weight.view(-1)[0] = float("nan")
+    # What is not finite spreads within an update
+    with pytest.raises(DivergedError, match=rf"{network}.{name} are not finite|weights \(\w+\.[\w.]+ first\)"):
+        model.train(1, 4)
+
+
+def test_the_posterior_is_watched() -> None:
+    watch = PosteriorWatch()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        watch.check(10.0)
+    with pytest.warns(UserWarning, match="collapsed: z says nothing about the task"):
+        watch.check(1e-4)
+    with pytest.warns(UserWarning, match="exploded"):
+        watch.check(1e6)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        watch.check(1e-4)  # once is enough
+
+
+def test_a_collapsed_posterior_is_warned_of_in_training(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl(kl_coef=1000.0, learning_rate=0.01, gradient_steps=300)
+    with pytest.warns(UserWarning, match="collapsed"):
+        model.learn(3 * ROLLOUT)

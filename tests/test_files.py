@@ -1,0 +1,141 @@
+"""Files from strangers and damaged ones: nothing of them runs, and one sentence says what is wrong."""
+
+import base64
+import io
+import json
+import pickle
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cloudpickle  # type: ignore[import-untyped]
+import numpy as np
+import pytest
+import torch as th
+from conftest import ENV_ID
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sb3_htr import PEARL, evaluate_adaptation, load_untrusted
+from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.htr import EpisodeClustering
+from sb3_htr.pearl.files import SavesToFiles
+
+MakePEARL = Callable[..., PEARL]
+ROLLOUT = 4 * 3 * 20
+
+
+class Bomb:
+    """A pickle that runs code."""
+
+    def __init__(self, fuse: Path) -> None:
+        self.fuse = fuse
+
+    def __reduce__(self) -> Any:
+        return Path.touch, (self.fuse,)
+
+
+def bombs(fuse: Path) -> list[bytes]:
+    """Files that make a mark when they are unpickled: as SB3's buffers, as torch saves, and hidden in a state dict."""
+    nested = io.BytesIO()
+    th.save({"replay": Bomb(fuse), "task_bank": {}}, nested)
+    alone = io.BytesIO()
+    th.save(Bomb(fuse), alone)
+    return [pickle.dumps(Bomb(fuse)), cloudpickle.dumps({"replay": Bomb(fuse)}), nested.getvalue(), alone.getvalue()]
+
+
+def repack(source: Path, target: Path, changed: dict[str, bytes]) -> None:
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
+        for name in old.namelist():
+            new.writestr(name, changed.get(name, old.read(name)))
+
+
+def test_the_bombs_are_live(tmp_path: Path) -> None:
+    for i, bomb in enumerate(bombs(tmp_path / "fuse")):
+        load = pickle.loads if i < 2 else lambda data: th.load(io.BytesIO(data), weights_only=False)
+        load(bomb)
+        assert (tmp_path / "fuse").exists()
+        (tmp_path / "fuse").unlink()
+
+
+def test_loading_a_replay_buffer_runs_no_code(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    model = tiny_pearl()
+    for bomb in bombs(tmp_path / "fuse"):
+        (tmp_path / "bomb.pt").write_bytes(bomb)
+        with pytest.raises(ValueError, match=r"bomb\.pt is damaged, or no replay buffer of sb3_htr"):
+            model.load_replay_buffer(tmp_path / "bomb.pt")
+    assert not (tmp_path / "fuse").exists()
+
+
+def test_loading_an_untrusted_model_runs_no_code(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    fuse = tmp_path / "fuse"
+    tiny_pearl().save(tmp_path / "model.zip")
+    for bomb in bombs(fuse):
+        repack(tmp_path / "model.zip", tmp_path / "bomb.zip", {"policy.pth": bomb})
+        with pytest.raises(ValueError, match=r"bomb\.zip is damaged, or no model saved by PEARL"):
+            load_untrusted(tmp_path / "bomb.zip", ENV_ID)
+    with zipfile.ZipFile(tmp_path / "model.zip") as archive:
+        data = json.loads(archive.read("data"))
+    serialized = {":type:": "x", ":serialized:": base64.b64encode(cloudpickle.dumps(Bomb(fuse))).decode()}
+    hostile: dict[str, Any] = {name: serialized for name in [*data, "learning_rate", "gamma", "replay_buffer_class"]}
+    hostile["policy_kwargs"] = {**data["policy_kwargs"], "optimizer_class": serialized}
+    repack(tmp_path / "model.zip", tmp_path / "bomb.zip", {"data": json.dumps(hostile).encode()})
+    load_untrusted(tmp_path / "bomb.zip", ENV_ID)  # its settings are ignored, its weights are fine
+    assert not fuse.exists()
+
+
+def test_an_untrusted_model_acts_as_the_one_that_was_saved(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    model = tiny_pearl(gamma=0.7, kl_coef=0.02).learn(3 * ROLLOUT)
+    model.save(tmp_path / "model.zip")
+    loaded = load_untrusted(tmp_path / "model.zip", ENV_ID)
+    assert loaded.gamma == 0.7 and loaded.kl_coef == 0.02
+    for a, b in zip(evaluate_adaptation(model, ENV_ID), evaluate_adaptation(loaded, ENV_ID), strict=True):
+        np.testing.assert_array_equal(a, b)
+    with pytest.raises(ValueError, match="do not fit the env or the settings"):
+        load_untrusted(tmp_path / "model.zip", "SparseTargetSpeed-v0", policy_kwargs={"latent_dim": 7})
+
+
+@given(st.binary(max_size=300))
+def test_garbage_is_refused(tmp_path_factory: pytest.TempPathFactory, garbage: bytes) -> None:
+    file = tmp_path_factory.getbasetemp() / "garbage"
+    file.write_bytes(garbage)
+    with pytest.raises(ValueError, match="is damaged, or no model saved by PEARL"):
+        load_untrusted(file, ENV_ID)
+
+
+@pytest.mark.parametrize("part", [0.0, 0.3, 0.9, 0.999])
+def test_truncated_files_are_refused(tiny_pearl: MakePEARL, tmp_path: Path, part: float) -> None:
+    model = tiny_pearl().learn(ROLLOUT)
+    model.save(tmp_path / "model.zip")
+    model.save_replay_buffer(tmp_path / "buffer.pt")
+    for name in ("model.zip", "buffer.pt"):
+        data = (tmp_path / name).read_bytes()
+        (tmp_path / name).write_bytes(data[: int(part * len(data))])
+    with pytest.raises(ValueError, match="is damaged"):
+        load_untrusted(tmp_path / "model.zip", ENV_ID)
+    with pytest.raises(ValueError, match="is damaged"):
+        model.load_replay_buffer(tmp_path / "buffer.pt")
+
+
+def test_a_replay_buffer_of_other_settings_is_refused(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    tiny_pearl().learn(ROLLOUT).save_replay_buffer(tmp_path / "buffer")
+    with pytest.raises(ValueError, match="make the model with the replay_buffer_class that it was saved with"):
+        tiny_pearl(replay_buffer_class=EpisodeClustering).load_replay_buffer(tmp_path / "buffer")
+    with pytest.raises(ValueError, match="use the settings that they were saved with"):
+        tiny_pearl(buffer_size=10_000).load_replay_buffer(tmp_path / "buffer")
+    with pytest.raises(ValueError, match="pass env="):
+        PEARL("MlpPolicy", None, _init_setup_model=False).load_replay_buffer(tmp_path / "buffer")
+
+
+def test_streams_work_as_files_do(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl().learn(ROLLOUT)
+    assert isinstance(model, SavesToFiles) and model.replay_buffer is not None
+    model_file, buffer_file = io.BytesIO(), io.BytesIO()
+    model.save(model_file)
+    model.save_replay_buffer(buffer_file)
+    model_file.seek(0)
+    buffer_file.seek(0)
+    loaded = PEARL.load(model_file, env=make_task_vec_env(ENV_ID, 4))
+    loaded.load_replay_buffer(buffer_file)
+    assert loaded.replay_buffer is not None and loaded.replay_buffer.size() == model.replay_buffer.size()
