@@ -1,6 +1,7 @@
 """Envs and settings that cannot work are refused in one sentence, before any work is lost."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -8,13 +9,17 @@ import numpy as np
 import pytest
 from conftest import ENV_ID
 from gymnasium import spaces
+from hypothesis import given
+from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from htr_envs import PointRobotEnv
+from htr_envs import PointRobotEnv, PointRobotVectorEnv
 from sb3_htr import PEARL
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
+from sb3_htr.zoo.cli import main
 
 MakePEARL = Callable[..., PEARL]
+ROLLOUT = 4 * 3 * 20
 
 
 class WithoutTaskId(gym.Wrapper[Any, Any, Any, Any]):
@@ -71,7 +76,14 @@ def test_an_unknown_id_is_gymnasiums_business(tiny_pearl: MakePEARL) -> None:
         ({"context_size": 0}, "context_size is 0"),
         ({"n_tasks_per_rollout": 0}, "n_tasks_per_rollout is 0"),
         ({"n_episodes_per_task": 0}, "n_episodes_per_task is 0"),
-        ({"kl_coef": -0.1}, "kl_coef is -0.1, expected 0 or more"),
+        ({"kl_coef": -0.1}, "kl_coef is -0.1, expected at least 0"),
+        ({"gamma": 1.1}, "gamma is 1.1, expected a number from 0 to 1"),
+        ({"tau": float("nan")}, "tau is nan"),
+        ({"gradient_steps": 0}, "gradient_steps is 0"),
+        ({"learning_starts": -1}, "learning_starts is -1"),
+        ({"n_exploration_episodes": -1}, "n_exploration_episodes is -1"),
+        ({"replay_buffer_kwargs": {"relabel_probabilty": 1}}, "'relabel_probabilty': did you mean relabel_probability"),
+        ({"replay_buffer_kwargs": {"grid": 1}}, "replay_buffer_kwargs has no setting 'grid': expected one of"),
         ({"explorer": "random"}, "explorer is 'random', expected one of"),
         ({"train_explorer": "random"}, "explorer is 'random'"),
         ({"policy_kwargs": {"latent_dim": 0}}, "latent_dim is 0, expected at least 1"),
@@ -85,13 +97,105 @@ def test_settings(kwargs: dict[str, Any], message: str) -> None:
         PEARL(**{"policy": "MlpPolicy", "env": ENV_ID, **kwargs})
 
 
-def test_rewards_that_become_nan_stop_training(tiny_pearl: MakePEARL) -> None:
-    class Broken(gym.RewardWrapper[Any, Any]):
-        def reward(self, reward: Any) -> Any:
-            return float("nan")
+class Changed(gym.Wrapper[Any, Any, Any, Any]):
+    """An env with one thing wrong in its steps."""
 
-    with pytest.raises(ValueError, match=r"The reward of task .* is nan, expected finite numbers"):
-        tiny_pearl(Broken(gym.make(ENV_ID))).learn(1)
+    def __init__(self, env: gym.Env[Any, Any], change: Callable[[int, list[Any]], None]) -> None:
+        super().__init__(env)
+        self.change = change
+        self.n_steps = 0
+
+    def step(self, action: Any) -> Any:
+        values = list(self.env.step(action))
+        self.n_steps += 1
+        self.change(self.n_steps, values)
+        return tuple(values)
+
+
+def put(position: int, value: Any) -> Callable[[int, list[Any]], None]:
+    def change(n_steps: int, values: list[Any]) -> None:
+        values[position] = value
+
+    return change
+
+
+def another_task(n_steps: int, values: list[Any]) -> None:
+    values[4] = {**values[4], "task_id": n_steps % 7}
+
+
+def no_training_task(n_steps: int, values: list[Any]) -> None:
+    values[4] = {**values[4], "task_id": -1}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (put(1, float("nan")), r"The reward of task .* is nan, expected finite numbers"),
+        (put(1, float("inf")), r"The reward of task .* is inf, expected finite numbers"),
+        (put(0, np.full(2, np.nan, dtype=np.float32)), r"The next observation of task .* is \[nan nan\], expected finite"),
+        (put(1, 0.5), r"The env gave 0.5 for a step of task \d+, but its compute_reward gives 0: .*check_task_env"),
+        (put(3, False), r"An episode is longer than the env's time limit of 20 steps"),
+        (another_task, r"The task of env 0 changed from \d to \d within an episode"),
+        (no_training_task, r"info\['task_id'\] is -1, expected a training task"),
+    ],
+)
+def test_envs_that_do_something_wrong(tiny_pearl: MakePEARL, change: Callable[[int, list[Any]], None], message: str) -> None:
+    # outside of gymnasium's own checker, which would be the first to see some of it
+    env = gym.make(ENV_ID, disable_env_checker=True)
+    with pytest.raises(ValueError, match=message):
+        tiny_pearl(Changed(env, change), n_tasks_per_rollout=1).learn(1)
+
+
+def test_episodes_of_one_step_are_episodes(tiny_pearl: MakePEARL) -> None:
+    env = Changed(gym.make(ENV_ID), put(2, True))
+    model = tiny_pearl(env, n_tasks_per_rollout=1, n_episodes_per_task=50).learn(200)
+    assert model.replay_buffer is not None and model.replay_buffer.n_episodes.sum() == 200
+
+
+def test_an_env_may_reuse_its_arrays(tiny_pearl: MakePEARL) -> None:
+    class Reusing(PointRobotVectorEnv):
+        def step(self, actions: Any) -> Any:
+            obs, *rest = super().step(actions)
+            self.shared = getattr(self, "shared", np.empty_like(obs))
+            self.shared[:] = obs
+            return self.shared, *rest
+
+    env = BatchedTaskVecEnv(Reusing(4))
+    model = tiny_pearl(env).learn(ROLLOUT)
+    assert model.replay_buffer is not None
+    rows = model.replay_buffer.episodes.rows[model.replay_buffer.episodes.index().rows]
+    moved = np.abs(rows[:, 5:7] - rows[:, :2]).max(axis=1)
+    assert (moved > 0).mean() > 0.9 and moved.max() <= 0.1 + 1e-6
+
+
+def test_a_meta_batch_may_be_larger_than_the_number_of_tasks(tiny_pearl: MakePEARL) -> None:
+    env = make_task_vec_env(ENV_ID, 2, env_kwargs={"n_train_tasks": 2, "n_test_tasks": 1})
+    tiny_pearl(env, n_tasks_per_rollout=2, meta_batch_size=50).learn(2 * ROLLOUT)
+
+
+def test_unknown_keys_of_a_yaml_file_are_refused_with_the_nearest_known_one(tmp_path: Path) -> None:
+    arguments = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-n", "10", "-params"]
+    with pytest.raises(ValueError, match=r"PEARL has no setting 'kl_coeff': did you mean kl_coef\?"):
+        main([*arguments, "kl_coeff:0.1"])
+    assert not list(tmp_path.rglob("*.zip"))
+
+
+numbers = st.one_of(st.integers(-3, 300), st.floats(-2, 2), st.just(float("nan")), st.just(float("inf")))
+
+
+@given(
+    st.dictionaries(
+        st.sampled_from(["meta_batch_size", "batch_size", "context_size", "gamma", "tau", "kl_coef", "gradient_steps"]),
+        numbers,
+    ),
+    st.dictionaries(st.sampled_from(["relabel_probability", "context_episodes", "relabel", "rl_batch_source"]), numbers),
+)
+def test_fuzzed_settings_are_taken_or_refused_in_one_sentence(kwargs: dict[str, Any], replay: dict[str, Any]) -> None:
+    try:
+        PEARL("MlpPolicy", ENV_ID, replay_buffer_kwargs=replay, _init_setup_model=bool(replay), **kwargs)
+    except ValueError as error:
+        assert str(error).count("\n") == 0
+        assert any(name in str(error) for name in (*kwargs, *replay))
 
 
 def test_options_of_a_batch_must_agree() -> None:

@@ -1,9 +1,20 @@
 """Says early and in one sentence why an env cannot be meta-trained on."""
 
+import difflib
+import inspect
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
 from sb3_htr.common.type_aliases import TaskFamily
+
+if TYPE_CHECKING:
+    from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
+
+VARIADIC = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
 
 
 def check_spaces(env: VecEnv) -> None:
@@ -14,6 +25,60 @@ def check_spaces(env: VecEnv) -> None:
     for name, space in (("observation", env.observation_space), ("action", env.action_space)):
         if not isinstance(space, spaces.Box) or len(space.shape) != 1:
             raise ValueError(f"The {name} space is {space}, but PEARL needs a Box of one axis: flatten it with a wrapper.")
+
+
+def check_numbers(**numbers: tuple[float, float, float]) -> None:
+    """
+    :param numbers: name of a setting, its value, and the smallest and largest value that it may have
+    :raises ValueError: for the first one that is out of its range
+    """
+    for name, (value, low, high) in numbers.items():
+        if not low <= value <= high:
+            expected = f"at least {low:g}" if high == float("inf") else f"a number from {low:g} to {high:g}"
+            raise ValueError(f"{name} is {value}, expected {expected}.")
+
+
+def check_keywords(owner: str, given: Iterable[str], function: Callable[..., Any], also: Iterable[str] = ()) -> None:
+    """
+    :param owner: whose keywords they are, for the message
+    :param given: names that a user gave
+    :param function: that takes them, or a class
+    :param also: names that are known elsewhere
+    :raises ValueError: for the first name that is not known, with the one most like it
+    """
+    known: set[str] = set(also)
+    for part in getattr(function, "__mro__", (function,)):
+        # A class that hands its keywords on has those of its parent too
+        parameters = inspect.signature(vars(part).get("__init__", part) if isinstance(part, type) else part).parameters
+        known |= {name for name, parameter in parameters.items() if parameter.kind not in VARIADIC}
+        if not any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in parameters.values()):
+            break
+    known -= {"self"}
+    for name in given:
+        if name not in known:
+            nearest = difflib.get_close_matches(name, known, n=1)
+            advice = f"did you mean {nearest[0]}?" if nearest else f"expected one of {sorted(known)}."
+            raise ValueError(f"{owner} has no setting {name!r}: {advice}")
+
+
+def check_reward_hook(buffer: "MultiTaskReplayBuffer") -> None:
+    """
+    :param buffer: with episodes, rewarded by the env
+    :raises ValueError: if the reward hook disagrees with what the env gave
+    """
+    index = buffer.episodes.index()
+    rows = buffer.episodes.rows[index.rows[: buffer.size()]]
+    task = np.repeat(np.arange(buffer.n_tasks), np.diff(index.task_row[: buffer.n_tasks + 1]))
+    given = rows[:, buffer.context_dim - 1]
+    tasks = buffer.task_family.train_tasks[task]
+    computed = buffer.task_family.compute_reward(buffer.trajectory(rows[:, None]), tasks)[:, 0]
+    wrong = ~np.isclose(given, computed, rtol=1e-4, atol=1e-4)
+    if wrong.any():
+        i = int(wrong.argmax())
+        raise ValueError(
+            f"The env gave {given[i]:g} for a step of task {task[i]}, but its compute_reward gives {computed[i]:g}: "
+            "relabelled rewards would be of another task family. Run htr_envs.check_task_env(env) to find out why."
+        )
 
 
 def get_task_family(env: VecEnv) -> TaskFamily:

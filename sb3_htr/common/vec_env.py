@@ -60,7 +60,8 @@ class BatchedTaskVecEnv(VecEnv):
         for i in np.flatnonzero(dones):
             infos[i]["terminal_observation"] = final_obs[i]
             infos[i]["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
-        return obs, rewards, dones, infos
+        # An env may write into the same array at each step, and this one is kept
+        return obs.copy(), rewards, dones, infos
 
     def _split(self, info: dict[str, Any]) -> list[dict[str, Any]]:
         columns = [value.tolist() if value.ndim == 1 else list(value) for value in info.values()]

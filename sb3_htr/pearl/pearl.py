@@ -115,18 +115,23 @@ class PEARL(SavesToFiles):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ) -> None:
-        sizes = {
-            "meta_batch_size": meta_batch_size,
-            "batch_size": batch_size,
-            "context_size": context_size,
-            "n_tasks_per_rollout": n_tasks_per_rollout,
-            "n_episodes_per_task": n_episodes_per_task,
-        }
-        for name, size in sizes.items():
-            if size < 1:
-                raise ValueError(f"{name} is {size}, expected at least 1.")
-        if kl_coef < 0:
-            raise ValueError(f"kl_coef is {kl_coef}, expected 0 or more.")
+        infinity = float("inf")
+        checks.check_numbers(
+            meta_batch_size=(meta_batch_size, 1, infinity),
+            batch_size=(batch_size, 1, infinity),
+            context_size=(context_size, 1, infinity),
+            n_tasks_per_rollout=(n_tasks_per_rollout, 1, infinity),
+            n_episodes_per_task=(n_episodes_per_task, 1, infinity),
+            n_exploration_episodes=(n_exploration_episodes, 0, infinity),
+            gradient_steps=(gradient_steps, 1, infinity),
+            learning_starts=(learning_starts, 0, infinity),
+            target_update_interval=(target_update_interval, 1, infinity),
+            kl_coef=(kl_coef, 0, infinity),
+            gamma=(gamma, 0, 1),
+            tau=(tau, 0, 1),
+        )
+        buffer_class = replay_buffer_class or MultiTaskReplayBuffer
+        checks.check_keywords("replay_buffer_kwargs", replay_buffer_kwargs or {}, buffer_class)
         if isinstance(env, str):
             env = make_task_vec_env(env, n_tasks_per_rollout, seed=seed)
         if env is not None:
@@ -142,7 +147,7 @@ class PEARL(SavesToFiles):
             tau=tau,
             gamma=gamma,
             gradient_steps=gradient_steps,
-            replay_buffer_class=replay_buffer_class or MultiTaskReplayBuffer,
+            replay_buffer_class=buffer_class,
             replay_buffer_kwargs=replay_buffer_kwargs,
             ent_coef=ent_coef,
             target_update_interval=target_update_interval,
@@ -286,6 +291,8 @@ class PEARL(SavesToFiles):
         rollout = collect_adaptations(self, env, callback, replay_buffer, learning_starts)
         if not rollout.continue_training:
             return rollout
+        if self._n_rollouts == 0:
+            checks.check_reward_hook(replay_buffer)
         self.task_bank.update(replay_buffer)
         self.logger.record("rollout/train_tasks_reached", len(self.task_bank.solved))
         callback.on_rollout_end()

@@ -27,6 +27,7 @@ import htr_envs  # noqa: F401 registers the envs
 from sb3_htr import PEARL
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.callbacks import MetaEvalCallback, MetaTrialEvalCallback, ProgressCallback
+from sb3_htr.common.checks import check_keywords
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr import EpisodeClustering
 from sb3_htr.pearl.checkpoint import CheckpointCallback, checkpoints, cut_monitor_files, load_latest
@@ -35,6 +36,8 @@ from sb3_htr.zoo.evaluate import find_run
 from sb3_htr.zoo.hyperparams import hyperparams_file
 
 PACKAGES = ("sb3_htr", "stable_baselines3", "gymnasium", "rl_zoo3", "torch", "numpy", "mujoco")
+# What a YAML file may have beside the arguments of PEARL
+ZOO_SETTINGS = ("n_envs", "n_timesteps", "normalize", "env_wrapper", "vec_env_wrapper", "callback", "env_kwargs")
 # Tasks that an evaluation adapts to side by side
 N_EVAL_ENVS = 20
 
@@ -50,6 +53,7 @@ class MetaExperimentManager(ExperimentManager):
     def _preprocess_hyperparams(
         self, hyperparams: dict[str, Any]
     ) -> tuple[dict[str, Any], Callable[..., Any] | None, list[BaseCallback], Callable[..., Any] | None]:
+        check_keywords("PEARL", hyperparams, PEARL, also=ZOO_SETTINGS)
         processed = super()._preprocess_hyperparams(hyperparams)
         if self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = dict(self.env_kwargs)
