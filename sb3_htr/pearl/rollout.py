@@ -33,13 +33,20 @@ def collect_adaptations(
     """
     n_steps, n_episodes = 0, 0
     for _ in range(-(-model.n_tasks_per_rollout // env.num_envs)):
-        adaptation = _begin(model, env, replay_buffer)
+        tasks = _next_tasks(model, env.num_envs)
+        adaptation = _begin(model, env, replay_buffer, tasks)
         remaining = np.full(env.num_envs, model.n_episodes_per_task)
         while (remaining > 0).any():
             obs = model._last_obs
             assert isinstance(obs, np.ndarray)
             actions, buffer_actions = _choose_actions(model, obs, adaptation, learning_starts)
-            new_obs, rewards, dones, infos = env.step(actions)
+            try:
+                new_obs, rewards, dones, infos = env.step(actions)
+            except (EOFError, ConnectionError) as error:
+                raise RuntimeError(
+                    f"The process of an env died at env step {model.num_timesteps}, on one of the training tasks "
+                    f"{tasks.tolist()}: its own traceback is printed above. Envs in one process (vec_env dummy) show it here."
+                ) from error
             model.num_timesteps += env.num_envs
             n_steps += env.num_envs
             # Give access to local variables
@@ -57,9 +64,9 @@ def collect_adaptations(
     return RolloutReturn(n_steps, n_episodes, continue_training=True)
 
 
-def _begin(model: "PEARL", env: VecEnv, replay_buffer: MultiTaskReplayBuffer) -> Adaptation:
-    """Give every env the next training task."""
-    env.set_options([{"task_id": int(task)} for task in _next_tasks(model, env.num_envs)])
+def _begin(model: "PEARL", env: VecEnv, replay_buffer: MultiTaskReplayBuffer, tasks: np.ndarray) -> Adaptation:
+    """Give every env its training task."""
+    env.set_options([{"task_id": int(task)} for task in tasks])
     model._last_obs = env.reset()  # type: ignore[assignment]
     check_task_ids(env)
     if model._vec_normalize_env is not None:

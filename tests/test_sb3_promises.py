@@ -1,0 +1,139 @@
+"""What users of Stable-Baselines3 rely on in any algorithm."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from conftest import ENV_ID
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import CallbackList, CheckpointCallback, EveryNTimesteps, StopTrainingOnMaxEpisodes
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_htr import PEARL
+from sb3_htr.common.vec_env import make_task_vec_env
+
+MakePEARL = Callable[..., PEARL]
+ROLLOUT = 4 * 3 * 20
+
+
+def test_parameters_can_be_read_and_set(tiny_pearl: MakePEARL) -> None:
+    model, other = tiny_pearl().learn(2 * ROLLOUT), tiny_pearl(seed=5)
+    parameters: dict[str, Any] = model.get_parameters()
+    assert set(parameters) == {"policy", "actor.optimizer", "critic.optimizer", "encoder.optimizer"}
+    other.set_parameters(parameters)
+    for name, value in model.policy.state_dict().items():
+        assert th.equal(value, other.policy.state_dict()[name]), name
+    with pytest.raises(ValueError, match="Names of parameters do not match"):
+        other.set_parameters({"policy": parameters["policy"]})
+    other.set_parameters({"policy": parameters["policy"]}, exact_match=False)
+
+
+def test_deterministic_predictions_repeat_and_others_do_not(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    obs, z = np.zeros((3, 2), dtype=np.float32), np.zeros((3, 3), dtype=np.float32)
+    same = [model.predict(obs, (z,), deterministic=True)[0] for _ in range(2)]
+    np.testing.assert_array_equal(same[0], same[1])
+    assert (model.predict(obs, (z,))[0] != model.predict(obs, (z,))[0]).any()
+    single, _ = model.predict(obs[0], (z[:1],), deterministic=True)
+    assert single.shape == (2,)
+    np.testing.assert_allclose(single, same[0][0], atol=1e-6)
+
+
+def test_predicting_leaves_training_mode_and_gradients_alone(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl().learn(2 * ROLLOUT)
+    model.predict(np.zeros(2, dtype=np.float32), (np.zeros((1, 3), dtype=np.float32),))
+    assert not model.policy.training
+    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
+    model.predict(np.zeros(2, dtype=np.float32), (np.zeros((1, 3), dtype=np.float32),))
+    assert all(th.equal(value, before[name]) for name, value in model.policy.state_dict().items())
+
+
+def test_training_goes_on_without_resetting_the_count(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl().learn(2 * ROLLOUT)
+    episodes, updates = model._episode_num, model._n_updates
+    model.learn(ROLLOUT, reset_num_timesteps=False)
+    assert model.num_timesteps == 3 * ROLLOUT and model._episode_num > episodes and model._n_updates > updates
+    model.learn(ROLLOUT)
+    assert model.num_timesteps == ROLLOUT
+
+
+def test_sb3s_callbacks_work(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    save = CheckpointCallback(60, str(tmp_path), save_replay_buffer=True)
+    stop = StopTrainingOnMaxEpisodes(max_episodes=10)  # of each env
+    model = tiny_pearl()
+    model.learn(10 * ROLLOUT, callback=CallbackList([EveryNTimesteps(100, save), stop]))
+    assert model.num_timesteps < 10 * ROLLOUT and model._episode_num >= 36
+    assert list(tmp_path.glob("*.zip")) and list(tmp_path.glob("*replay_buffer*"))
+
+
+def test_the_logger_can_be_replaced(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    model = tiny_pearl()
+    model.set_logger(configure(str(tmp_path), ["csv", "json"]))
+    model.learn(3 * ROLLOUT)
+    header = (tmp_path / "progress.csv").read_text().splitlines()[0].split(",")
+    assert {"time/total_timesteps", "rollout/ep_rew_mean", "train/critic_loss", "train/learning_rate"} <= set(header)
+
+
+def test_envs_can_be_replaced_by_equal_ones_only(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl().learn(ROLLOUT)
+    model.set_env(make_task_vec_env(ENV_ID, 4))
+    model.learn(ROLLOUT, reset_num_timesteps=False)
+    with pytest.raises(AssertionError, match="number of environments"):
+        model.set_env(make_task_vec_env(ENV_ID, 3))
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        model.set_env(make_task_vec_env("SparseTargetSpeed-v0", 4))
+
+
+def test_the_normalization_of_an_env_is_found(tiny_pearl: MakePEARL) -> None:
+    env = VecNormalize(make_task_vec_env(ENV_ID, 4), norm_reward=False)
+    assert tiny_pearl(env).get_vec_normalize_env() is env
+    assert tiny_pearl().get_vec_normalize_env() is None
+
+
+class Rescaled(gym.ActionWrapper[Any, Any, Any]):
+    """The same robot with actions in other units."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.action_space = spaces.Box(np.array([0.0, -30.0]), np.array([2.0, 50.0]), dtype=np.float64)
+
+    def action(self, action: Any) -> Any:
+        low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
+        return (2 * (action - low) / (high - low) - 1).astype(np.float32)
+
+
+def test_actions_of_any_bounds(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl(Rescaled(gym.make(ENV_ID)), n_tasks_per_rollout=2).learn(3 * ROLLOUT)
+    actions, _ = model.predict(np.zeros((50, 2), dtype=np.float32), (np.random.randn(50, 3).astype(np.float32),))
+    assert model.action_space.contains(actions[0].astype(np.float64))
+    assert model.replay_buffer is not None
+    stored = model.replay_buffer.episodes.rows[model.replay_buffer.episodes.index().rows][:, 2:4]
+    assert np.abs(stored).max() <= 1 and stored.std() > 0.1
+
+
+def test_a_dead_env_process_is_named_and_hangs_nothing(tiny_pearl: MakePEARL) -> None:
+    from stable_baselines3.common.vec_env import SubprocVecEnv
+
+    def make() -> gym.Env[Any, Any]:
+        return Fragile(gym.make(ENV_ID))
+
+    env = SubprocVecEnv([make, make], start_method="fork")
+    with pytest.raises(
+        RuntimeError, match=r"process of an env died at env step \d+, on one of the training tasks \[\d+, \d+\]"
+    ):
+        tiny_pearl(env).learn(ROLLOUT)
+
+
+class Fragile(gym.Wrapper[Any, Any, Any, Any]):
+    n_steps = 0
+
+    def step(self, action: Any) -> Any:
+        self.n_steps += 1
+        if self.n_steps == 30:
+            raise ZeroDivisionError("a bug of the env")
+        return self.env.step(action)
