@@ -48,10 +48,12 @@ def family() -> htr_envs.PointRobotFamily:
     return htr_envs.PointRobotFamily()
 
 
-def make_buffer(family: Any, n_envs: int = 2, buffer_size: int = 8000, **kwargs: Any) -> MultiTaskReplayBuffer:
+def make_buffer(
+    family: Any, n_envs: int = 2, buffer_size: int = 8000, buffer_class: Any = MultiTaskReplayBuffer, **kwargs: Any
+) -> MultiTaskReplayBuffer:
     """An empty buffer for the point robot."""
     env = gym.make(ENV_ID)
-    return MultiTaskReplayBuffer(
+    buffer: MultiTaskReplayBuffer = buffer_class(
         buffer_size,
         env.observation_space,
         env.action_space,
@@ -59,6 +61,7 @@ def make_buffer(family: Any, n_envs: int = 2, buffer_size: int = 8000, **kwargs:
         n_envs=n_envs,
         **{"task_family": family, "max_episode_steps": 20, "seed": 0, **kwargs},
     )
+    return buffer
 
 
 def add_episode(

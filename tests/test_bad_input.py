@@ -71,12 +71,12 @@ def test_an_unknown_id_is_gymnasiums_business(tiny_pearl: MakePEARL) -> None:
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"meta_batch_size": 0}, "meta_batch_size is 0, expected at least 1"),
+        ({"meta_batch_size": 0}, "meta_batch_size is 0, expected a whole number of at least 1"),
         ({"batch_size": -1}, "batch_size is -1"),
         ({"context_size": 0}, "context_size is 0"),
         ({"n_tasks_per_rollout": 0}, "n_tasks_per_rollout is 0"),
         ({"n_episodes_per_task": 0}, "n_episodes_per_task is 0"),
-        ({"kl_coef": -0.1}, "kl_coef is -0.1, expected at least 0"),
+        ({"kl_coef": -0.1}, "kl_coef is -0.1, expected a number of at least 0"),
         ({"gamma": 1.1}, "gamma is 1.1, expected a number from 0 to 1"),
         ({"tau": float("nan")}, "tau is nan"),
         ({"gradient_steps": 0}, "gradient_steps is 0"),

@@ -10,7 +10,7 @@ import pytest
 import torch as th
 from conftest import ENV_ID
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import CallbackList, CheckpointCallback, EveryNTimesteps, StopTrainingOnMaxEpisodes
+from stable_baselines3.common.callbacks import CallbackList, CheckpointCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -66,7 +66,7 @@ def test_sb3s_callbacks_work(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
     save = CheckpointCallback(60, str(tmp_path), save_replay_buffer=True)
     stop = StopTrainingOnMaxEpisodes(max_episodes=10)  # of each env
     model = tiny_pearl()
-    model.learn(10 * ROLLOUT, callback=CallbackList([EveryNTimesteps(100, save), stop]))
+    model.learn(10 * ROLLOUT, callback=CallbackList([save, stop]))
     assert model.num_timesteps < 10 * ROLLOUT and model._episode_num >= 36
     assert list(tmp_path.glob("*.zip")) and list(tmp_path.glob("*replay_buffer*"))
 

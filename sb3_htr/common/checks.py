@@ -27,15 +27,20 @@ def check_spaces(env: VecEnv) -> None:
             raise ValueError(f"The {name} space is {space}, but PEARL needs a Box of one axis: flatten it with a wrapper.")
 
 
-def check_numbers(**numbers: tuple[float, float, float]) -> None:
+def check_numbers(**numbers: tuple[Any, float, float]) -> None:
     """
-    :param numbers: name of a setting, its value, and the smallest and largest value that it may have
-    :raises ValueError: for the first one that is out of its range
+    :param numbers: name of a setting, its value, and the smallest and largest value that it may have; with an int as the
+        smallest one, it must be a whole number
+    :raises ValueError: for the first one that is none, or out of its range
     """
     for name, (value, low, high) in numbers.items():
-        if not low <= value <= high:
-            expected = f"at least {low:g}" if high == float("inf") else f"a number from {low:g} to {high:g}"
-            raise ValueError(f"{name} is {value}, expected {expected}.")
+        whole = isinstance(low, int)
+        kind = int | np.integer if whole else int | float | np.number
+        # written so that nan, which compares with nothing, is refused too
+        if not (isinstance(value, kind) and low <= value <= high):
+            article = "a whole number" if whole else "a number"
+            limits = f"of at least {low:g}" if high == float("inf") else f"from {low:g} to {high:g}"
+            raise ValueError(f"{name} is {value!r}, expected {article} {limits}.")
 
 
 def check_keywords(owner: str, given: Iterable[str], function: Callable[..., Any], also: Iterable[str] = ()) -> None:

@@ -78,7 +78,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     :param argv: arguments, by default those of the process
     """
-    run_experiment("relabelling", __doc__, cells, 60_000, argv, plot)
+    run_experiment("relabelling", __doc__, cells, 40_000, argv, plot)
 
 
 if __name__ == "__main__":

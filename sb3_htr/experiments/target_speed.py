@@ -32,7 +32,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     :param argv: arguments, by default those of the process
     """
-    run_experiment("target_speed", __doc__, cells, 120_000, argv)
+    run_experiment("target_speed", __doc__, cells, 60_000, argv)
 
 
 if __name__ == "__main__":

@@ -28,8 +28,11 @@ class GridDiscretiser:
     """
 
     def __init__(self, cell_size: float | list[float]) -> None:
-        self.cell_size = np.asarray(cell_size, dtype=np.float32)
-        if not (self.cell_size > 0).all():
+        try:
+            self.cell_size = np.asarray(cell_size, dtype=np.float32)
+        except (TypeError, ValueError):
+            raise ValueError(f"cell_size is {cell_size!r}, expected positive widths.") from None
+        if not ((self.cell_size > 0) & np.isfinite(self.cell_size)).all() or self.cell_size.size == 0:
             raise ValueError(f"cell_size is {cell_size}, expected positive widths.")
 
     def __call__(self, tasks: np.ndarray) -> np.ndarray:
@@ -72,7 +75,7 @@ class EpisodeClustering(MultiTaskReplayBuffer):
         exploratory_fraction: float = 0.3,
         **kwargs: Any,
     ) -> None:
-        if not 0 <= exploratory_fraction < 1:
+        if not (isinstance(exploratory_fraction, int | float) and 0 <= exploratory_fraction < 1):
             raise ValueError(f"exploratory_fraction is {exploratory_fraction}, expected a number from 0 to below 1.")
         self.discretiser = GridDiscretiser(cell_size) if discretiser is None else discretiser
         self.exploratory_fraction = exploratory_fraction

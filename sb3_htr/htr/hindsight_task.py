@@ -41,7 +41,7 @@ def to_hindsight_task_strategy(strategy: HindsightTaskStrategy | str) -> Hindsig
         return strategy
     try:
         return KEY_TO_HINDSIGHT_TASK_STRATEGY[strategy.lower()]
-    except KeyError:
+    except (KeyError, AttributeError):
         raise ValueError(
             f"hindsight_task_strategy is {strategy!r}, expected one of {sorted(KEY_TO_HINDSIGHT_TASK_STRATEGY)}."
         ) from None

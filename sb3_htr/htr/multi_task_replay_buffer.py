@@ -8,6 +8,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_htr.common.checks import check_numbers
 from sb3_htr.common.random_state import get_generator_state, set_generator_state
 from sb3_htr.common.type_aliases import MultiTaskSamples, TaskFamily, Trajectory
 from sb3_htr.htr.episode_store import EpisodeIndex, EpisodeStore
@@ -91,14 +92,15 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         context_episodes: int = 10,
         seed: int | None = None,
     ) -> None:
-        if not 0 <= relabel_probability <= 1:
-            raise ValueError(f"relabel_probability is {relabel_probability}, expected a number from 0 to 1.")
+        check_numbers(
+            relabel_probability=(relabel_probability, 0.0, 1.0),
+            context_episodes=(context_episodes, 1, float("inf")),
+            buffer_size=(buffer_size, 1, float("inf")),
+        )
         if rl_batch_source not in ("episode", "task"):
             raise ValueError(f'rl_batch_source is {rl_batch_source!r}, expected "episode" or "task".')
         if rl_reward_type not in ("sparse", "dense"):
             raise ValueError(f'rl_reward_type is {rl_reward_type!r}, expected "sparse" or "dense".')
-        if context_episodes < 1:
-            raise ValueError(f"context_episodes is {context_episodes}, expected at least 1.")
         if optimize_memory_usage:
             raise ValueError("optimize_memory_usage is not supported: MultiTaskReplayBuffer stores whole episodes.")
         n_tasks = len(task_family.train_tasks)

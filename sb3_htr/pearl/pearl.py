@@ -126,9 +126,9 @@ class PEARL(SavesToFiles):
             gradient_steps=(gradient_steps, 1, infinity),
             learning_starts=(learning_starts, 0, infinity),
             target_update_interval=(target_update_interval, 1, infinity),
-            kl_coef=(kl_coef, 0, infinity),
-            gamma=(gamma, 0, 1),
-            tau=(tau, 0, 1),
+            kl_coef=(kl_coef, 0.0, infinity),
+            gamma=(gamma, 0.0, 1.0),
+            tau=(tau, 0.0, 1.0),
         )
         buffer_class = replay_buffer_class or MultiTaskReplayBuffer
         checks.check_keywords("replay_buffer_kwargs", replay_buffer_kwargs or {}, buffer_class)

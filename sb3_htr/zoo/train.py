@@ -29,11 +29,11 @@ from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.callbacks import MetaEvalCallback, MetaTrialEvalCallback, ProgressCallback
 from sb3_htr.common.checks import check_keywords
 from sb3_htr.common.vec_env import make_task_vec_env
-from sb3_htr.htr import EpisodeClustering
 from sb3_htr.pearl.checkpoint import CheckpointCallback, checkpoints, cut_monitor_files, load_latest
 from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.zoo.evaluate import find_run
 from sb3_htr.zoo.hyperparams import hyperparams_file
+from sb3_htr.zoo.yaml_values import without_code
 
 PACKAGES = ("sb3_htr", "stable_baselines3", "gymnasium", "rl_zoo3", "torch", "numpy", "mujoco")
 # What a YAML file may have beside the arguments of PEARL
@@ -54,7 +54,7 @@ class MetaExperimentManager(ExperimentManager):
         self, hyperparams: dict[str, Any]
     ) -> tuple[dict[str, Any], Callable[..., Any] | None, list[BaseCallback], Callable[..., Any] | None]:
         check_keywords("PEARL", hyperparams, PEARL, also=ZOO_SETTINGS)
-        processed = super()._preprocess_hyperparams(hyperparams)
+        processed = super()._preprocess_hyperparams(without_code(hyperparams))
         if self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = dict(self.env_kwargs)
         return processed
@@ -180,8 +180,6 @@ def register() -> None:
             "EvalCallback": MetaEvalCallback,
             "TrialEvalCallback": MetaTrialEvalCallback,
             "CheckpointCallback": CheckpointCallback,
-            # so that `replay_buffer_class: EpisodeClustering` in a YAML file is found
-            "EpisodeClustering": EpisodeClustering,
         },
         rl_zoo3.train: {"ExperimentManager": MetaExperimentManager},
     }

@@ -1,0 +1,131 @@
+"""Anything may come in; what comes out is a result that keeps its promises, or one sentence."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from conftest import ENV_ID, make_buffer
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from htr_envs import PointRobotFamily, TargetSpeedFamily
+from sb3_htr.htr import EpisodeClustering, MultiTaskReplayBuffer
+from sb3_htr.zoo.cli import main
+from sb3_htr.zoo.yaml_values import without_code
+
+FAMILY = PointRobotFamily(n_train_tasks=5, n_test_tasks=2, n_validation_tasks=2)
+# 200 in CI, or more if the profile has more
+many = settings(max_examples=max(200, settings.default.max_examples if settings.default else 0))
+
+anything = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-5, 50),
+    st.floats(),
+    st.text(max_size=8),
+    st.lists(st.floats(-1, 1), max_size=3),
+    st.sampled_from(["random", "final", "even", "episode", "task", "sparse", "dense"]),
+)
+BUFFER_SETTINGS = [
+    *("relabel_probability", "hindsight_task_strategy", "rl_batch_source", "rl_reward_type", "context_episodes"),
+    *("buffer_size", "cell_size", "exploratory_fraction"),
+]
+
+
+@many
+@given(st.dictionaries(st.sampled_from(BUFFER_SETTINGS), anything, max_size=3), st.booleans())
+def test_buffers(kwargs: dict[str, Any], clustering: bool) -> None:
+    try:
+        buffer = make_buffer(FAMILY, buffer_class=EpisodeClustering if clustering else MultiTaskReplayBuffer, **kwargs)
+    except ValueError as error:
+        assert str(error).count("\n") == 0 and any(name in str(error) for name in kwargs)
+    except TypeError as error:
+        assert not clustering and "unexpected keyword" in str(error), "PEARL checks the names before"
+    else:
+        assert 0 <= buffer.relabel_probability <= 1 and buffer.context_episodes >= 1
+
+
+@many
+@given(st.data())
+def test_add_and_sample(data: st.DataObject) -> None:
+    """Whatever steps come, ``add`` takes them or refuses them, and ``sample`` only knows whole episodes of one task."""
+    buffer = make_buffer(
+        FAMILY,
+        n_envs=2,
+        buffer_size=5 * 20 * data.draw(st.integers(1, 4)),
+        relabel_probability=data.draw(st.floats(0, 1)),
+        hindsight_task_strategy=data.draw(st.sampled_from(["random", "final", "even"])),
+        rl_batch_source=data.draw(st.sampled_from(["episode", "task"])),
+    )
+    rng = np.random.default_rng(data.draw(st.integers(0, 99)))
+    tasks = np.zeros(2, dtype=np.int64)
+    done = np.full(2, True)
+    for _ in range(data.draw(st.integers(0, 60))):
+        tasks[done] = rng.integers(0, 5, done.sum())
+        obs, action = rng.normal(size=(2, 2, 2)).astype(np.float32)
+        done = rng.random(2) < data.draw(st.sampled_from([0.02, 0.3, 1.0]))
+        bad = data.draw(st.sampled_from([None] * 20 + ["nan", "task"]))
+        if bad == "nan":
+            obs[0, 0] = np.nan
+        infos = [{"task_id": 99 if bad == "task" else int(task), "task_free_reward": 0.0} for task in tasks]
+        before = buffer.size()
+        try:
+            buffer.add(obs, obs + 0.1, action, np.zeros(2), done, infos)
+        except ValueError as error:
+            assert buffer.size() == before
+            assert bad or "longer than the env's time limit" in str(error)
+            return
+    sizes = data.draw(st.tuples(st.integers(1, 7), st.integers(1, 9), st.integers(1, 30)))
+    if buffer.size() == 0:
+        with pytest.raises(ValueError, match="no complete episode"):
+            buffer.sample(sizes[0], meta_batch_size=sizes[1], context_size=sizes[2])
+        return
+    sample = buffer.sample(sizes[0], meta_batch_size=sizes[1], context_size=sizes[2])
+    assert sample.observations.shape == (sizes[1], sizes[0], 2) and sample.context.shape == (sizes[1], sizes[2], 5)
+    assert all(np.isfinite(np.asarray(tensor)).all() for tensor in sample)
+    assert (buffer.n_episodes[sample.task_ids] > 0).all()
+    assert (sample.context_mask.sum(dim=1) >= 1).all()
+
+
+@many
+@given(st.sampled_from([PointRobotFamily, TargetSpeedFamily]), st.data())
+def test_families(family: Any, data: st.DataObject) -> None:
+    names = ["goal_distance", "goal_radius", "n_train_tasks", "min_speed", "max_speed", "tolerance", "task_seed"]
+    number = st.one_of(st.integers(-2, 40), st.floats(-1, 12))
+    kwargs = data.draw(st.dictionaries(st.sampled_from(names), number, max_size=3))
+    try:
+        tasks = family(**kwargs).train_tasks
+    except (ValueError, TypeError) as error:
+        assert str(error)
+    else:
+        assert tasks.ndim == 2 and np.isfinite(tasks).all()
+
+
+CODE = "__import__('pathlib').Path({fuse!r}).touch()"
+
+
+@pytest.mark.parametrize("key", ["policy_kwargs", "replay_buffer_kwargs", "normalize", "replay_buffer_class"])
+def test_yaml_files_run_no_code(key: str, tmp_path: Path) -> None:
+    fuse = tmp_path / "fuse"
+    file = tmp_path / "hostile.yml"
+    block = {"policy": "MlpPolicy", "n_timesteps": 100, "n_envs": 2, key: CODE.format(fuse=str(fuse))}
+    file.write_text(yaml.safe_dump({ENV_ID: block}))
+    with pytest.raises(ValueError, match=rf"{key} is .*(which is code|expected one of)"):
+        main(["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(file)])
+    file.write_text(f"{ENV_ID}: !!python/object/apply:os.system ['touch {fuse}']")
+    with pytest.raises(yaml.YAMLError):
+        main(["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(file)])
+    assert not fuse.exists()
+
+
+@many
+@given(st.dictionaries(st.sampled_from(["policy_kwargs", "normalize", "replay_buffer_class"]), anything))
+def test_yaml_values(hyperparams: dict[str, Any]) -> None:
+    try:
+        read = without_code(hyperparams)
+    except (ValueError, ImportError) as error:
+        assert str(error).count("\n") == 0
+    else:
+        assert read.keys() == hyperparams.keys()
