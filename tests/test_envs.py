@@ -164,7 +164,8 @@ def test_single_and_batched_envs_agree_bit_for_bit(env_id: str) -> None:
             observation, reward, *ends, info = env.step(actions[i])
             np.testing.assert_array_equal(infos["final_obs"][i], observation)
             assert rewards[i] == reward and [terminated[i], truncated[i]] == ends
-            assert all(np.array_equal(infos[key][i], value) for key, value in info.items())
+            # rl_zoo3, once it is imported, adds a key to what TimeLimit returns in the whole process
+            assert all(np.array_equal(infos[key][i], value) for key, value in info.items() if key != "TimeLimit.truncated")
             assert infos["_final_obs"][i] == any(ends)
             if any(ends):
                 observation = env.reset()[0]
