@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -84,3 +85,23 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
         folder.mkdir()
         (folder / "other").write_text("x")
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["other"]
+
+
+def test_a_full_disk_stops_no_evaluation(tiny_pearl: MakePEARL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    env = make_task_vec_env(ENV_ID, 20)
+    callback = MetaEvalCallback(
+        env, eval_freq=60, n_adaptation_episodes=2, log_path=str(tmp_path), best_model_save_path=str(tmp_path), verbose=0
+    )
+    calls = []
+
+    def save(*args: Any, **kwargs: Any) -> None:
+        calls.append(args)
+        if len(calls) == 1:
+            raise OSError(28, "No space left on device")
+        original(*args, **kwargs)
+
+    original = np.savez_compressed
+    monkeypatch.setattr(np, "savez_compressed", save)
+    with pytest.warns(UserWarning, match=r"evaluations\.npz could not be written \(No space left on device\)"):
+        tiny_pearl().learn(3 * ROLLOUT, callback=callback)
+    assert len(np.load(tmp_path / "evaluations.npz")["timesteps"]) == 3, "the next one makes up for it"

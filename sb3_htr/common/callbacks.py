@@ -1,6 +1,8 @@
 """Evaluation during meta-training."""
 
 import os
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -96,26 +98,38 @@ class MetaEvalCallback(EvalCallback):
         self.returns.append(record.returns)
         self.successes.append(record.successes)
         if self.log_path is not None:
-            with atomic_path(f"{self.log_path}.npz") as path:
-                np.savez_compressed(
-                    path,
-                    timesteps=self.evaluations_timesteps,
-                    results=np.stack(self.returns)[:, :, -1],
-                    returns=np.stack(self.returns),
-                    successes=np.stack(self.successes),
-                )
+            self._write(f"{self.log_path}.npz", self._save_results)
         self.last_mean_reward = float(record.returns[:, -1].mean())
         self._log(record.returns, record.successes)
         continue_training = True
         if self.last_mean_reward > self.best_mean_reward:
             self.best_mean_reward = self.last_mean_reward
             if self.best_model_save_path is not None:
-                self.model.save(Path(self.best_model_save_path) / "best_model.zip")
+                self._write(f"{self.best_model_save_path}/best_model.zip", self.model.save)
             if self.callback_on_new_best is not None:
                 continue_training = self.callback_on_new_best.on_step()
         if self.callback is not None:
             continue_training = continue_training and self._on_event()
         return continue_training
+
+    @staticmethod
+    def _write(path: str, save: Callable[[str], None]) -> None:
+        """A disk that is full stops no training."""
+        try:
+            save(path)
+        except OSError as error:
+            warnings.warn(f"{path} could not be written ({error.strerror or error}). Training goes on.", stacklevel=2)
+
+    def _save_results(self, path: str) -> None:
+        # Everything so far, so a file that could not be written is made up for by the next one
+        with atomic_path(path) as temporary:
+            np.savez_compressed(
+                temporary,
+                timesteps=self.evaluations_timesteps,
+                results=np.stack(self.returns)[:, :, -1],
+                returns=np.stack(self.returns),
+                successes=np.stack(self.successes),
+            )
 
     def _log(self, returns: np.ndarray, successes: np.ndarray) -> None:
         found = successes.any(axis=1)

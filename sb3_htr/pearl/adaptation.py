@@ -9,8 +9,8 @@ from sb3_htr.pearl.task_search import TaskSearch
 
 # Episodes that may be worse than the best one, before the z of that one is acted with again: by turns with the z of the
 # training task that promises most and from the posterior. The posterior of an episode that only grazed its goal can be narrow
-# and beside it, so each setback widens it by its deviation. By measurement on the Point Robot (two models, 200 tasks drawn anew),
-# last return with 4 and with 6 12.9 and 12.8; without the training tasks 12.2 and 12.3.
+# and beside it, so each setback widens it by its deviation. By measurement on the Point Robot (two models, 200 tasks drawn
+# anew), last return with 4 and with 6 12.9 and 12.8; without the training tasks 12.2 and 12.3.
 MAX_SETBACKS = 4
 # A return without its task-free part is that much above 0, or it is 0: the difference of two sums of float32
 ROUNDING = 1e-5
