@@ -127,7 +127,7 @@ class MetaExperimentManager(ExperimentManager):
                 print(f"Interrupted at {model.num_timesteps} steps.")
             except DivergedError as error:
                 last = next(iter(checkpoints(Path(self.save_path))), None)
-                raise DivergedError(f"{error} The last checkpoint is {last}.") from None
+                raise DivergedError(f"{error} The last checkpoint: {last or 'none yet'}.") from None
             finally:
                 unfinished = model.num_timesteps < self.n_timesteps
                 if self._checkpointing is not None and (unfinished or self._checkpointing.stopping):
