@@ -77,8 +77,8 @@ def plot(results: dict[Cell, Path], path: Path) -> None:
         band(left, x, returns, colour, "o-", method)
         band(right, x, successes, colour, "o-", method)
     left.axhline(1, color=COLOURS[6], linestyle=":", linewidth=1)
-    left.set_ylabel("return of the 20th adaptation episode / optimum")
-    right.set_ylabel("test tasks solved in the 20th adaptation episode")
+    left.set_ylabel("return of the 20th episode / optimum")
+    right.set_ylabel("test tasks solved in the 20th episode")
     for axes in (left, right):
         axes.set_xlabel("distance of the goals (1.5: 30 steps, 2: 40 steps, else 20)")
         axes.set_ylim(-0.03, 1.05)
