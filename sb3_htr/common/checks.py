@@ -3,16 +3,13 @@
 import difflib
 import inspect
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
 from sb3_htr.common.type_aliases import TaskFamily
-
-if TYPE_CHECKING:
-    from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 
 VARIADIC = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
 
@@ -64,26 +61,6 @@ def check_keywords(owner: str, given: Iterable[str], function: Callable[..., Any
             nearest = difflib.get_close_matches(name, known, n=1)
             advice = f"did you mean {nearest[0]}?" if nearest else f"expected one of {sorted(known)}."
             raise ValueError(f"{owner} has no setting {name!r}: {advice}")
-
-
-def check_reward_hook(buffer: "MultiTaskReplayBuffer") -> None:
-    """
-    :param buffer: with episodes, rewarded by the env
-    :raises ValueError: if the reward hook disagrees with what the env gave
-    """
-    index = buffer.episodes.index()
-    rows = buffer.episodes.rows[index.rows[: buffer.size()]]
-    task = np.repeat(np.arange(buffer.n_tasks), np.diff(index.task_row[: buffer.n_tasks + 1]))
-    given = rows[:, buffer.context_dim - 1]
-    tasks = buffer.task_family.train_tasks[task]
-    computed = buffer.task_family.compute_reward(buffer.trajectory(rows[:, None]), tasks)[:, 0]
-    wrong = ~np.isclose(given, computed, rtol=1e-4, atol=1e-4)
-    if wrong.any():
-        i = int(wrong.argmax())
-        raise ValueError(
-            f"The env gave {given[i]:g} for a step of task {task[i]}, but its compute_reward gives {computed[i]:g}: "
-            "relabelled rewards would be of another task family. Run htr_envs.check_task_env(env) to find out why."
-        )
 
 
 def get_task_family(env: VecEnv) -> TaskFamily:

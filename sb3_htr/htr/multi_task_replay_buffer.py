@@ -232,6 +232,24 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         name = next(name for name, column in columns.items() if not np.isfinite(rows[i, column]).all())
         raise ValueError(f"The {name} of task {task[i]} (env {i}) is {rows[i, columns[name]]}, expected finite numbers.")
 
+    def check_reward_hook(self) -> None:
+        """
+        :raises ValueError: if the reward hook disagrees with what the env gave for the stored episodes
+        """
+        index = self.episodes.index()
+        rows = self.episodes.rows[index.rows[: self.size()]]
+        task = np.repeat(np.arange(self.n_tasks), np.diff(index.task_row[: self.n_tasks + 1]))
+        traj = self.trajectory(rows[:, None])
+        computed = self.task_family.compute_reward(traj, self.task_family.train_tasks[task])[:, 0]
+        given = rows[:, self._reward]
+        wrong = ~np.isclose(given, computed, rtol=1e-4, atol=1e-4)
+        if wrong.any():
+            i = int(wrong.argmax())
+            raise ValueError(
+                f"The env gave {given[i]:g} for a step of task {task[i]}, but its compute_reward gives {computed[i]:g}: "
+                "relabelled rewards would be of another task family. Run htr_envs.check_task_env(env) to find out why."
+            )
+
     def discard_open_episodes(self) -> None:
         """Forget unfinished episodes; to be called when the envs are reset before their episodes end."""
         self._open_length = np.zeros(self.n_envs, dtype=np.int64)

@@ -292,7 +292,7 @@ class PEARL(SavesToFiles):
         if not rollout.continue_training:
             return rollout
         if self._n_rollouts == 0:
-            checks.check_reward_hook(replay_buffer)
+            replay_buffer.check_reward_hook()
         self.task_bank.update(replay_buffer)
         self.logger.record("rollout/train_tasks_reached", len(self.task_bank.solved))
         callback.on_rollout_end()
