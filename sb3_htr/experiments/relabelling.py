@@ -29,7 +29,8 @@ def cells(n_seeds: int, n_timesteps: int) -> list[Cell]:
     :return: the defaults with each K; the other hindsight task strategies; the RL batch from all of the task's replay
     """
     settings: dict[str, dict[str, Any]] = {
-        **{_method(k): {"relabel_probability": k} for k in PROBABILITIES},
+        # The first one is what the others are compared with
+        **{_method(k): {"relabel_probability": k} for k in sorted(PROBABILITIES, key=lambda k: k != 0.8)},
         "strategy-random": {"hindsight_task_strategy": "random"},
         "strategy-final": {"hindsight_task_strategy": "final"},
         "rl-batch-task": {"rl_batch_source": "task"},
