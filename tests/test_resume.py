@@ -105,6 +105,22 @@ def test_runs_of_all_kinds_go_on_exactly(settings: list[str], tmp_path: Path) ->
     assert_same_run(copy, run)
 
 
+def test_tensorboard_shows_each_point_once(tmp_path: Path) -> None:
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+
+    def points(name: str) -> list[tuple[int, float]]:
+        folder = next((tmp_path / "tb").rglob("events*")).parent
+        events = accumulator.EventAccumulator(str(folder))
+        events.Reload()
+        return [(event.step, event.value) for event in events.Scalars(name)]
+
+    assert main([*TRAIN, "-f", str(tmp_path), "-tb", str(tmp_path / "tb")]) == 0
+    names = ["train/critic_loss", "rollout/ep_rew_mean", "eval/mean_reward"]
+    before = [points(name) for name in names]
+    assert main(["train", "--resume", str(tmp_path / "pearl" / f"{ENV_ID}_1")]) == 0
+    assert [points(name) for name in names] == before
+
+
 def test_kills_at_random_moments_change_nothing(unbroken: Path, tmp_path: Path) -> None:
     """SIGKILL of a real process, again and again."""
     n_kills = 20

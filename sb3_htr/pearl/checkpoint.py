@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import TensorBoardOutputFormat
 
 from sb3_htr.common.archive import DamagedArchive, read_archive, write_archive
 from sb3_htr.common.atomic import atomic_path
@@ -140,7 +141,15 @@ class CheckpointCallback(BaseCallback):
             set_env_state(self._pearl, self._pending["envs"])
             for name in LOGGER_STATE:
                 getattr(self.logger, name).update(self._pending["logger"][name])
+            for output, folder in zip(self._tensorboards(), self._pending["tensorboard_folders"], strict=True):
+                # Takes back what was logged after the checkpoint
+                writer = type(output.writer)(log_dir=folder, purge_step=self.num_timesteps + 1)
+                output.writer.close()
+                output.writer = writer
             self._pending = None
+
+    def _tensorboards(self) -> list[TensorBoardOutputFormat]:
+        return [output for output in self.logger.output_formats if isinstance(output, TensorBoardOutputFormat)]
 
     @property
     def _pearl(self) -> "PEARL":
@@ -180,6 +189,7 @@ class CheckpointCallback(BaseCallback):
                 for callback in (self, *self.companions)
             ],
             "monitor_files": self._monitor_files(),
+            "tensorboard_folders": [str(output.writer.log_dir) for output in self._tensorboards()],
         }
 
 
