@@ -134,6 +134,7 @@ def no_training_task(n_steps: int, values: list[Any]) -> None:
         (put(1, float("inf")), r"The reward of task .* is inf, expected finite numbers"),
         (put(0, np.full(2, np.nan, dtype=np.float32)), r"The next observation of task .* is \[nan nan\], expected finite"),
         (put(1, 0.5), r"The env gave 0.5 for a step of task \d+, but its compute_reward gives 0: .*check_task_env"),
+        (put(0, np.zeros(3, dtype=np.float32)), r"An env failed at env step \d+, on one of .* tasks \[\d+\].*the shape of"),
         (put(3, False), r"An episode is longer than the env's time limit of 20 steps"),
         (another_task, r"The task of env 0 changed from \d to \d within an episode"),
         (no_training_task, r"info\['task_id'\] is -1, expected a training task"),

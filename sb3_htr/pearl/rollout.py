@@ -42,6 +42,11 @@ def collect_adaptations(
             actions, buffer_actions = _choose_actions(model, obs, adaptation, learning_starts)
             try:
                 new_obs, rewards, dones, infos = env.step(actions)
+            except ValueError as error:
+                raise ValueError(
+                    f"An env failed at env step {model.num_timesteps}, on one of the training tasks {tasks.tolist()} "
+                    f"({error}): its observations must have the shape of its observation_space."
+                ) from error
             except (EOFError, ConnectionError) as error:
                 raise RuntimeError(
                     f"The process of an env died at env step {model.num_timesteps}, on one of the training tasks "
