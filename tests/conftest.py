@@ -18,6 +18,12 @@ settings.register_profile("ci", deadline=None, max_examples=50)
 settings.register_profile("nightly", deadline=None, max_examples=2000)
 settings.load_profile("ci")
 
+
+def many(test: Callable[..., None]) -> Callable[..., None]:
+    """For fuzzing: 200 examples, or more if the profile has more."""
+    return settings(max_examples=max(200, settings().max_examples))(test)
+
+
 ENV_ID = "SparsePointRobot-v0"
 TINY: dict[str, Any] = {
     "n_tasks_per_rollout": 4,

@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from conftest import ENV_ID
+from conftest import ENV_ID, many
 from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
@@ -184,6 +184,7 @@ def test_unknown_keys_of_a_yaml_file_are_refused_with_the_nearest_known_one(tmp_
 numbers = st.one_of(st.integers(-3, 300), st.floats(-2, 2), st.just(float("nan")), st.just(float("inf")))
 
 
+@many
 @given(
     st.dictionaries(
         st.sampled_from(["meta_batch_size", "batch_size", "context_size", "gamma", "tau", "kl_coef", "gradient_steps"]),

@@ -105,3 +105,24 @@ def test_a_full_disk_stops_no_evaluation(tiny_pearl: MakePEARL, tmp_path: Path, 
     with pytest.warns(UserWarning, match=r"evaluations\.npz could not be written \(No space left on device\)"):
         tiny_pearl().learn(3 * ROLLOUT, callback=callback)
     assert len(np.load(tmp_path / "evaluations.npz")["timesteps"]) == 3, "the next one makes up for it"
+
+
+def test_a_best_model_that_could_not_be_written_is_not_the_best(
+    tiny_pearl: MakePEARL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    callback = MetaEvalCallback(
+        make_task_vec_env(ENV_ID, 20), eval_freq=60, n_adaptation_episodes=2, best_model_save_path=str(tmp_path), verbose=0
+    )
+    model = tiny_pearl()
+    save, paths = type(model).save, []
+
+    def failing_once(self: PEARL, path: Path) -> None:
+        paths.append(path)
+        if len(paths) == 1:
+            raise OSError(28, "No space left on device")
+        save(self, path)
+
+    monkeypatch.setattr(type(model), "save", failing_once)
+    with pytest.warns(UserWarning, match=r"best_model\.zip could not be written"):
+        model.learn(3 * ROLLOUT, callback=callback)
+    assert len(paths) >= 2 and (tmp_path / "best_model.zip").exists()

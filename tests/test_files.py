@@ -13,7 +13,7 @@ import cloudpickle  # type: ignore[import-untyped]
 import numpy as np
 import pytest
 import torch as th
-from conftest import ENV_ID
+from conftest import ENV_ID, many
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -96,6 +96,7 @@ def test_an_untrusted_model_acts_as_the_one_that_was_saved(tiny_pearl: MakePEARL
         load_untrusted(tmp_path / "model.zip", "SparseTargetSpeed-v0", policy_kwargs={"latent_dim": 7})
 
 
+@many
 @given(st.binary(max_size=300))
 def test_garbage_is_refused(tmp_path_factory: pytest.TempPathFactory, garbage: bytes) -> None:
     file = tmp_path_factory.getbasetemp() / "garbage"

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from conftest import ENV_ID, make_buffer
-from hypothesis import given, settings
+from conftest import ENV_ID, make_buffer, many
+from hypothesis import given
 from hypothesis import strategies as st
 
 from htr_envs import PointRobotFamily, TargetSpeedFamily
@@ -16,9 +16,6 @@ from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.yaml_values import without_code
 
 FAMILY = PointRobotFamily(n_train_tasks=5, n_test_tasks=2, n_validation_tasks=2)
-# 200 in CI, or more if the profile has more
-many = settings(max_examples=max(200, settings.default.max_examples if settings.default else 0))
-
 anything = st.one_of(
     st.none(),
     st.booleans(),

@@ -148,8 +148,10 @@ def test_kills_at_random_moments_change_nothing(unbroken: Path, tmp_path: Path) 
         else:  # it was faster, and is done
             assert_same_run(run, unbroken)
             shutil.rmtree(tmp_path / "pearl")
+    (run / "checkpoints" / ".240_steps.1.tmp").mkdir()  # as a kill while writing leaves it
     subprocess.run([*command, "train", "--resume", str(run)], env=environment, check=True, capture_output=True)
     assert_same_run(run, unbroken)
+    assert len(list((run / "checkpoints").iterdir())) == 2
 
 
 def test_an_interrupt_stops_with_a_checkpoint_and_says_how_to_go_on(unbroken: Path, tmp_path: Path) -> None:

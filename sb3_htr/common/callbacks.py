@@ -103,9 +103,10 @@ class MetaEvalCallback(EvalCallback):
         self._log(record.returns, record.successes)
         continue_training = True
         if self.last_mean_reward > self.best_mean_reward:
-            self.best_mean_reward = self.last_mean_reward
-            if self.best_model_save_path is not None:
-                self._write(f"{self.best_model_save_path}/best_model.zip", self.model.save)
+            best_model = self.best_model_save_path and f"{self.best_model_save_path}/best_model.zip"
+            # A model that could not be written must not keep a later one from being written
+            if best_model is None or self._write(best_model, self.model.save):
+                self.best_mean_reward = self.last_mean_reward
             if self.callback_on_new_best is not None:
                 continue_training = self.callback_on_new_best.on_step()
         if self.callback is not None:
@@ -113,12 +114,14 @@ class MetaEvalCallback(EvalCallback):
         return continue_training
 
     @staticmethod
-    def _write(path: str, save: Callable[[str], None]) -> None:
-        """A disk that is full stops no training."""
+    def _write(path: str, save: Callable[[str], None]) -> bool:
+        """Whether it could be written: a disk that is full stops no training."""
         try:
             save(path)
         except OSError as error:
             warnings.warn(f"{path} could not be written ({error.strerror or error}). Training goes on.", stacklevel=2)
+            return False
+        return True
 
     def _save_results(self, path: str) -> None:
         # Everything so far, so a file that could not be written is made up for by the next one

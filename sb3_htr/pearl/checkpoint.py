@@ -176,7 +176,8 @@ class CheckpointCallback(BaseCallback):
         self._stopped = self.stopping
         if self.verbose > 0:
             print(f"Checkpoint: {folder}")
-        for old in checkpoints(self.run)[self.keep :]:
+        # Those of killed processes, which could not clean up, too
+        for old in [*checkpoints(self.run)[self.keep :], *folder.parent.glob(".*_steps.*.tmp")]:
             shutil.rmtree(old)
 
     def _state(self) -> dict[str, Any]:
