@@ -19,8 +19,8 @@ from conftest import ENV_ID
 from stable_baselines3.common.monitor import load_results
 
 from sb3_htr import PEARL
-from sb3_htr.common.archive import MANIFEST, STATE, DamagedArchive, read_archive, write_archive
-from sb3_htr.pearl.checkpoint import checkpoints, load_latest
+from sb3_htr.common.checkpoint import MANIFEST, STATE, DamagedCheckpoint, read_checkpoint, write_checkpoint
+from sb3_htr.pearl.resume import checkpoints, load_latest
 from sb3_htr.zoo.cli import main
 
 # Rollouts of 4 tasks x 3 episodes x 20 steps, 10 of them, a checkpoint after each
@@ -214,8 +214,8 @@ def test_a_damaged_checkpoint_gives_one_sentence_and_the_next_older_one_is_taken
     run = cut_off(unbroken, tmp_path, STEPS)
     newest, older = checkpoints(run)
     damage(newest)
-    with pytest.raises(DamagedArchive) as error:
-        read_archive(newest)
+    with pytest.raises(DamagedCheckpoint) as error:
+        read_checkpoint(newest)
     assert str(newest) in str(error.value) and len(str(error.value).split(". ")) == 1
     with pytest.warns(UserWarning, match="next older checkpoint"):
         assert load_latest(run)[0] == older
@@ -237,14 +237,14 @@ class Bomb:
 
 def test_reading_a_checkpoint_runs_no_code(tmp_path: Path) -> None:
     fuse = tmp_path / "exploded"
-    write_archive(tmp_path / "1_steps", {"bomb": Bomb(fuse)})
+    write_checkpoint(tmp_path / "1_steps", {"bomb": Bomb(fuse)})
     with pytest.raises(Exception, match=r"(?i)weights.only"):
-        read_archive(tmp_path / "1_steps")
+        read_checkpoint(tmp_path / "1_steps")
     assert not fuse.exists()
 
 
 def test_a_full_disk_stops_no_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import sb3_htr.pearl.checkpoint as module
+    import sb3_htr.pearl.resume as module
 
     calls = []
 
@@ -252,9 +252,9 @@ def test_a_full_disk_stops_no_training(tmp_path: Path, monkeypatch: pytest.Monke
         calls.append(folder)
         if len(calls) in (2, 3):
             raise OSError(28, "No space left on device")
-        write_archive(folder, state)
+        write_checkpoint(folder, state)
 
-    monkeypatch.setattr(module, "write_archive", write)
+    monkeypatch.setattr(module, "write_checkpoint", write)
     with pytest.warns(UserWarning, match="No space left on device.*Training goes on"):
         assert main([*TRAIN, "-f", str(tmp_path)]) == 0
     steps = [int(folder.name.split("_")[0]) for folder in calls]

@@ -16,11 +16,11 @@ STATE, MANIFEST = "state.pt", "manifest.json"
 PACKAGES = ("sb3_htr", "stable_baselines3", "torch", "numpy", "gymnasium")
 
 
-class DamagedArchive(ValueError):
+class DamagedCheckpoint(ValueError):
     """A folder that cannot be read, with the reason."""
 
 
-def write_archive(folder: str | os.PathLike[str], state: dict[str, Any]) -> None:
+def write_checkpoint(folder: str | os.PathLike[str], state: dict[str, Any]) -> None:
     """
     :param folder: to make; its files appear all at once or not at all
     :param state: nested dicts, lists and tuples of tensors, numbers, strings, None
@@ -37,12 +37,12 @@ def write_archive(folder: str | os.PathLike[str], state: dict[str, Any]) -> None
         (temporary / MANIFEST).write_text(json.dumps(manifest, indent=1))
 
 
-def read_archive(folder: str | os.PathLike[str], device: th.device | str = "cpu") -> dict[str, Any]:
+def read_checkpoint(folder: str | os.PathLike[str], device: th.device | str = "cpu") -> dict[str, Any]:
     """
-    :param folder: of :func:`write_archive`
+    :param folder: of :func:`write_checkpoint`
     :param device: where tensors are put
     :return: the state
-    :raises DamagedArchive: if it is incomplete, changed, or of another format
+    :raises DamagedCheckpoint: if it is incomplete, changed, or of another format
     """
     folder = Path(folder)
     try:
@@ -50,15 +50,17 @@ def read_archive(folder: str | os.PathLike[str], device: th.device | str = "cpu"
         found, expected = manifest["format"], manifest["sha256"][STATE]
         writer = manifest["versions"]["sb3_htr"]
     except (OSError, ValueError, KeyError, TypeError):
-        raise DamagedArchive(f"{folder} has no readable {MANIFEST}: it is damaged, or no checkpoint.") from None
+        raise DamagedCheckpoint(f"{folder} has no readable {MANIFEST}: it is damaged, or no checkpoint.") from None
     if found != FORMAT:
-        raise DamagedArchive(f"{folder} has format {found}, expected {FORMAT}: read it with sb3_htr {writer}, which wrote it.")
+        raise DamagedCheckpoint(
+            f"{folder} has format {found}, expected {FORMAT}: read it with sb3_htr {writer}, which wrote it."
+        )
     try:
         intact = _sha256(folder / STATE) == expected
     except OSError:
         intact = False
     if not intact:
-        raise DamagedArchive(f"{folder / STATE} is missing or not what was written: the checkpoint is damaged.")
+        raise DamagedCheckpoint(f"{folder / STATE} is missing or not what was written: the checkpoint is damaged.")
     state: dict[str, Any] = th.load(folder / STATE, map_location=device, weights_only=True)
     return state
 

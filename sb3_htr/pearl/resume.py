@@ -10,8 +10,8 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import TensorBoardOutputFormat
 
-from sb3_htr.common.archive import DamagedArchive, read_archive, write_archive
 from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.checkpoint import DamagedCheckpoint, read_checkpoint, write_checkpoint
 from sb3_htr.pearl.state import get_env_state, get_training_state, set_env_state, set_training_state
 
 if TYPE_CHECKING:
@@ -52,8 +52,8 @@ def load_latest(run: Path, device: str = "cpu") -> tuple[Path, dict[str, Any]]:
     """
     for folder in checkpoints(run):
         try:
-            return folder, read_archive(folder, device)
-        except DamagedArchive as error:
+            return folder, read_checkpoint(folder, device)
+        except DamagedCheckpoint as error:
             warnings.warn(f"{error} The next older checkpoint is tried.", stacklevel=2)
     raise FileNotFoundError(f"There is no checkpoint to go on from in {run / 'checkpoints'}: train again, with --save-freq.")
 
@@ -164,7 +164,7 @@ class CheckpointCallback(BaseCallback):
             return
         folder = self.run / "checkpoints" / f"{self.num_timesteps}_steps"
         try:
-            write_archive(folder, self._state())
+            write_checkpoint(folder, self._state())
         except OSError as error:
             warnings.warn(
                 f"The checkpoint {folder} could not be written ({error.strerror or error}). Training goes on, and tries again "
