@@ -52,9 +52,7 @@ def read_checkpoint(folder: str | os.PathLike[str], device: th.device | str = "c
     except (OSError, ValueError, KeyError, TypeError):
         raise DamagedCheckpoint(f"{folder} has no readable {MANIFEST}: it is damaged, or no checkpoint.") from None
     if found != FORMAT:
-        raise DamagedCheckpoint(
-            f"{folder} has format {found}, expected {FORMAT}: read it with sb3_htr {writer}, which wrote it."
-        )
+        raise DamagedCheckpoint(f"{folder} has format {found}, expected {FORMAT}: read it with sb3_htr {writer}, its writer.")
     try:
         intact = _sha256(folder / STATE) == expected
     except OSError:
