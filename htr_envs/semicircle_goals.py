@@ -9,6 +9,7 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, at_step, check_reward_type
+from htr_envs.task_split import split_evenly
 
 
 class SemicircleGoalFamily(TaskFamily):
@@ -41,22 +42,15 @@ class SemicircleGoalFamily(TaskFamily):
             raise ValueError(f"goal_distance is {goal_distance}, expected a number above 0 and up to {arena}.")
         if not goal_radius > 0.0:
             raise ValueError(f"goal_radius is {goal_radius}, expected a number above 0.")
-        if min(n_train_tasks, n_test_tasks, n_validation_tasks) < 1:
-            raise ValueError(
-                f"n_train_tasks, n_test_tasks, n_validation_tasks are {n_train_tasks}, {n_test_tasks}, {n_validation_tasks}: "
-                "each must be at least 1."
-            )
         self.goal_distance = float(goal_distance)
         self.goal_radius = float(goal_radius)
-        # numpy never changes RandomState's stream, as it may Generator's: the tasks stay the same for good
-        random_state = np.random.RandomState(task_seed)
-        angles = np.linspace(0.0, np.pi, n_train_tasks + n_test_tasks)
-        random_state.shuffle(angles)
+        angles = split_evenly(0.0, np.pi, n_train_tasks, n_validation_tasks, n_test_tasks, task_seed)
+        train, validation, test = map(self._goals, angles)
         super().__init__(
             task_space=spaces.Box(-arena, arena, (2,), np.float32),
-            train_tasks=self._goals(angles[:n_train_tasks]),
-            validation_tasks=self._goals(random_state.uniform(0.0, np.pi, n_validation_tasks)),
-            test_tasks=self._goals(angles[n_train_tasks:]),
+            train_tasks=train,
+            validation_tasks=validation,
+            test_tasks=test,
         )
 
     def _goals(self, angles: NDArray[np.float64]) -> FloatArray:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from htr_envs.rendering import draw_target_speed
 from htr_envs.task_env import BoolArray, FloatArray, TaskEnv, TaskFamily, Trajectory, at_step, check_reward_type
+from htr_envs.task_split import split_evenly
 from htr_envs.task_vector_env import TaskVectorEnv
 
 FRICTION = np.float32(0.95)
@@ -67,24 +68,17 @@ class TargetSpeedFamily(TaskFamily):
             )
         if not tolerance > 0.0:
             raise ValueError(f"tolerance is {tolerance}, expected a number above 0.")
-        if min(n_train_tasks, n_test_tasks, n_validation_tasks) < 1:
-            raise ValueError(
-                f"n_train_tasks, n_test_tasks, n_validation_tasks are {n_train_tasks}, {n_test_tasks}, {n_validation_tasks}: "
-                "each must be at least 1."
-            )
         self.min_speed = float(min_speed)
         self.max_speed = float(max_speed)
         self.tolerance = float(tolerance)
-        # numpy never changes RandomState's stream, as it may Generator's: the tasks stay the same for good
-        random_state = np.random.RandomState(task_seed)
-        speeds = np.linspace(min_speed, max_speed, n_train_tasks + n_test_tasks)[:, None]
-        random_state.shuffle(speeds)
+        speeds = split_evenly(min_speed, max_speed, n_train_tasks, n_validation_tasks, n_test_tasks, task_seed)
+        train, validation, test = (values[:, None] for values in speeds)
         super().__init__(
             # the corner of the box of velocities, rounded up
             task_space=spaces.Box(0.0, np.float32(1.5 * TOP_SPEED), (1,), np.float32),
-            train_tasks=speeds[:n_train_tasks],
-            validation_tasks=random_state.uniform(min_speed, max_speed, (n_validation_tasks, 1)),
-            test_tasks=speeds[n_train_tasks:],
+            train_tasks=train,
+            validation_tasks=validation,
+            test_tasks=test,
         )
 
     def sample_tasks(self, n: int, rng: np.random.Generator) -> FloatArray:
