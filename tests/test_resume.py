@@ -121,6 +121,15 @@ def test_tensorboard_shows_each_point_once(tmp_path: Path) -> None:
     assert [points(name) for name in names] == before
 
 
+def test_the_last_one_cleans_up(unbroken: Path, tmp_path: Path) -> None:
+    """Killed after the last checkpoint was written and before older ones were removed, and while writing one."""
+    run = cut_off(unbroken, tmp_path, STEPS)
+    shutil.copytree(checkpoints(run)[-1], run / "checkpoints" / "1_steps")
+    (run / "checkpoints" / ".240_steps.1.tmp").mkdir()
+    assert main(["train", "--resume", str(run)]) == 0
+    assert sorted((run / "checkpoints").iterdir()) == sorted(checkpoints(run)) and len(checkpoints(run)) == 2
+
+
 def test_kills_at_random_moments_change_nothing(unbroken: Path, tmp_path: Path) -> None:
     """SIGKILL of a real process, again and again."""
     n_kills = 20

@@ -176,8 +176,15 @@ class CheckpointCallback(BaseCallback):
         self._stopped = self.stopping
         if self.verbose > 0:
             print(f"Checkpoint: {folder}")
-        # Those of killed processes, which could not clean up, too
-        for old in [*checkpoints(self.run)[self.keep :], *folder.parent.glob(".*_steps.*.tmp")]:
+        self._remove_old()
+
+    def _on_training_end(self) -> None:
+        # A process killed between writing its last checkpoint and cleaning up leaves that to the one that goes on
+        self._remove_old()
+
+    def _remove_old(self) -> None:
+        # Those of killed processes, too
+        for old in [*checkpoints(self.run)[self.keep :], *(self.run / "checkpoints").glob(".*_steps.*.tmp")]:
             shutil.rmtree(old)
 
     def _state(self) -> dict[str, Any]:
