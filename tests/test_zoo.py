@@ -14,7 +14,7 @@ from sb3_htr import PEARL
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr import EpisodeClustering
 from sb3_htr.zoo.cli import main
-from sb3_htr.zoo.hyperparams import hyperparams_file
+from sb3_htr.zoo.shipped import hyperparams_file
 from sb3_htr.zoo.train import MetaExperimentManager
 
 SMALL = [

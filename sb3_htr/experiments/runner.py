@@ -17,7 +17,7 @@ from sb3_htr import PEARL
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.evaluation import evaluate_adaptation
 from sb3_htr.common.vec_env import make_task_vec_env
-from sb3_htr.zoo.evaluate import find_run
+from sb3_htr.zoo.agents import find_run
 
 # Means over the training of what HTR paper, B.2 reasons with
 LOGGED = ("relabelled_fraction", "rl_reward_mean", "rl_zero_reward_fraction")

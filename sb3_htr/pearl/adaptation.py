@@ -109,6 +109,28 @@ class Adaptation:
             return self.n_episodes < self.n_exploration_episodes
         return self.best_return <= 0
 
+    def posterior(self) -> tuple[np.ndarray, np.ndarray]:
+        """
+        :return: mean and standard deviation (n_envs, latent_dim) of the posterior over the best episode (explorer PRIOR: over
+            all episodes), those of N(0, I) where there is none yet
+        """
+        return self._posterior(np.arange(len(self.z)))
+
+    def deviation(self) -> np.ndarray:
+        """
+        :return: (n_envs, latent_dim), standard deviation of what is known about z: of what the explorer draws from while
+            exploring, of the posterior afterwards
+        """
+        prior = self.policy.latent_prior
+        if self._search is not None:
+            belief, known = self._search.belief, self._search.known.z
+            exploring = np.sqrt(np.maximum(belief @ known**2 - (belief @ known) ** 2, 0.0))
+        elif self.explorer is Explorer.PRIOR:
+            exploring = np.ones_like(self.z)
+        else:
+            exploring = np.tile(prior.aggregate_scale * prior.cholesky.norm(dim=1).cpu().numpy(), (len(self.z), 1))
+        return np.where(self.exploring()[:, None], exploring, self.posterior()[1])
+
     def frozen_z(self) -> np.ndarray:
         """
         :return: (n_envs, latent_dim), the z to act with when no more episodes follow: that of the best episode, or, where none
@@ -131,6 +153,13 @@ class Adaptation:
             self.z[envs[visit]] = self._search.begin(envs[visit], exploring[visit])
 
     def _sample_posterior(self, envs: np.ndarray) -> np.ndarray:
+        mean, deviation = self._posterior(envs)
+        if self.explorer is not Explorer.PRIOR:
+            deviation *= 1 + self._setbacks[envs, None]
+        return mean + deviation * th.randn(mean.shape, generator=self.generator).numpy()
+
+    def _posterior(self, envs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and standard deviation (k, latent_dim) for some envs."""
         row = np.arange(self._n_rows[envs].max())
         if self.explorer is Explorer.PRIOR:
             mask = row < self._n_rows[envs, None]
@@ -141,7 +170,4 @@ class Adaptation:
         with th.no_grad():
             context = th.as_tensor(self._rows[envs, : len(row)], device=device)
             mean, variance = self.policy.encoder(context, th.as_tensor(mask, dtype=th.float32, device=device))
-        deviation = variance.sqrt().cpu().numpy()
-        if self.explorer is not Explorer.PRIOR:
-            deviation *= 1 + self._setbacks[envs, None]
-        return mean.cpu().numpy() + deviation * th.randn(mean.shape, generator=self.generator).numpy()
+        return mean.cpu().numpy(), variance.sqrt().cpu().numpy()

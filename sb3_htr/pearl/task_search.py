@@ -24,6 +24,11 @@ class TaskSearch:
         self._n_steps = np.zeros(n_envs, dtype=np.int64)
         self._since_start = np.zeros(n_envs, dtype=bool)
 
+    @property
+    def belief(self) -> np.ndarray:
+        """Probability of each known task, (n_envs, n)."""
+        return self._belief.belief
+
     def begin(self, envs: np.ndarray, exploring: np.ndarray) -> np.ndarray:
         """
         Visit known tasks in the episodes that begin.

@@ -1,22 +1,47 @@
 """The command ``sb3-htr``."""
 
 import importlib
+import os
 import sys
 from collections.abc import Sequence
 
+import gymnasium
+
 COMMANDS = {
     "train": "meta-train an agent, with rl_zoo3's arguments and YAML files",
-    "evaluate": "adapt a trained agent to unseen tasks; prints a table and draws two pictures",
+    "evaluate": "adapt an agent to unseen tasks: a table, two pictures and the data",
+    "enjoy": "watch an agent adapt, task by task",
+    "record": "film an agent that adapts, as mp4 or gif",
+    "plot": "learning curves, adaptation curves, paths and the latent space, of one or several runs",
+    "optimize": "search for hyperparameters with Optuna, by the return after adaptation",
+    "export": "a small file to share, with a model card; can upload both to the Hugging Face Hub",
 }
-USAGE = "usage: sb3-htr COMMAND [ARGUMENTS]; sb3-htr COMMAND --help explains the arguments.\n\n" + "\n".join(
-    f"  {name:<10} {text}" for name, text in COMMANDS.items()
+USAGE = (
+    "usage: sb3-htr COMMAND [ARGUMENTS]; sb3-htr COMMAND --help explains the arguments.\n\n"
+    + "\n".join(f"  {name:<10} {text}" for name, text in COMMANDS.items())
+    + "\n\nTo begin with, an agent that comes with the package:\n\n  sb3-htr enjoy --env SparsePointRobot-v0"
 )
+# Packages that the base installation does not bring, and the extra that does
+EXTRAS = {
+    "rl_zoo3": "zoo",
+    "optuna": "zoo",
+    "huggingface_hub": "zoo",
+    "matplotlib": "plots",
+    "rliable": "plots",
+    "PIL": "video",
+    "imageio_ffmpeg": "video",
+    "mujoco": "mujoco",
+    "tensorboard": "tensorboard",
+    "psycopg": "postgresql",
+}
+# What a user can put right: bad settings and files, missing packages, unknown envs, training that diverges
+MISTAKES = (ValueError, OSError, ImportError, gymnasium.error.Error, FloatingPointError)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """
     :param argv: arguments, by default those of the process
-    :return: exit status: 0, or 2 for arguments that cannot be understood
+    :return: exit status: 0, 1 if a package is missing, 2 for arguments that cannot be understood
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments and arguments[0] in ("-h", "--help"):
@@ -27,15 +52,31 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     command, *rest = arguments
     try:
-        module = importlib.import_module(f"sb3_htr.zoo.{command}")
+        importlib.import_module(f"sb3_htr.zoo.{command}").main(rest)
     except ModuleNotFoundError as error:
-        if (error.name or "").startswith("sb3_htr"):
+        package = (error.name or "").split(".")[0]
+        if package not in EXTRAS:
             raise
-        print(f"sb3-htr needs {error.name}, which is not installed: pip install 'sb3_htr[zoo]'", file=sys.stderr)
+        print(
+            f"sb3-htr {command} needs {package}, which is not installed: pip install 'sb3_htr[{EXTRAS[package]}]'",
+            file=sys.stderr,
+        )
         return 1
-    module.main(rest)
     return 0
 
 
+def console() -> int:
+    """
+    :return: exit status of :func:`main`; 1 and a sentence, without the way to it, for what a user can put right
+    """
+    try:
+        return main()
+    except MISTAKES as error:
+        if os.environ.get("SB3_HTR_TRACEBACK"):
+            raise
+        print(f"sb3-htr: {error}\n(SB3_HTR_TRACEBACK=1 in the environment shows where this comes from)", file=sys.stderr)
+        return 1
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(console())

@@ -31,8 +31,8 @@ from sb3_htr.common.checks import check_keywords
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.pearl.resume import CheckpointCallback, checkpoints, cut_monitor_files, load_latest
-from sb3_htr.zoo.evaluate import find_run
-from sb3_htr.zoo.hyperparams import hyperparams_file
+from sb3_htr.zoo.agents import find_run
+from sb3_htr.zoo.shipped import hyperparams_file
 from sb3_htr.zoo.yaml_values import without_code
 
 PACKAGES = ("sb3_htr", "stable_baselines3", "gymnasium", "rl_zoo3", "torch", "numpy", "mujoco")

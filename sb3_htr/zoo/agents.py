@@ -1,0 +1,219 @@
+"""Trained agents: where they are, and the env that each was trained on."""
+
+import importlib
+import json
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+
+import htr_envs  # noqa: F401 registers the envs
+from sb3_htr import PEARL
+from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.zoo.shipped import shipped
+
+# Record of a run: in its folder, and in an exported model file
+RECORD = "run.json"
+# Method of a run in a log folder, and the order in which the shipped agents are looked through
+METHODS = ("pearl", "htr-ser", "htr-ec", "pearl-dense", "pearl-sparse")
+
+
+@dataclass(frozen=True)
+class TrainedAgent:
+    """
+    :param path: model file
+    :param record: of its training: ``env_id``, ``env_kwargs``, ``gym_packages``, and in an exported file ``normalize``
+    :param folder: run folder, None for a model file of its own
+    """
+
+    path: Path
+    record: dict[str, Any]
+    folder: Path | None
+
+    @property
+    def env_id(self) -> str:
+        """Env that it was trained on."""
+        return str(self.record["env_id"])
+
+    @property
+    def name(self) -> str:
+        """How a picture calls it: the run folder or the file."""
+        return self.folder.name if self.folder is not None else f"{self.path.parent.name}/{self.path.stem}"
+
+    def load(self, device: str = "cpu") -> PEARL:
+        """
+        :param device: torch device
+        :return: the model
+        """
+        return PEARL.load(self.path, device=device)
+
+    def make_env(self, render_mode: str | None = None) -> gym.Env:
+        """
+        :param render_mode: of the env
+        :return: one env, whose observations are not normalized
+        """
+        return gym.make(self.env_id, render_mode=render_mode, **self.record["env_kwargs"])
+
+    def make_vec_env(self, n_envs: int) -> VecEnv:
+        """
+        :param n_envs: number of envs
+        :return: the envs, in the VecNormalize of the training if that had one
+        """
+        return self.normalized(make_task_vec_env(self.env_id, n_envs, env_kwargs=self.record["env_kwargs"]))
+
+    def normalized(self, env: VecEnv) -> VecEnv:
+        """
+        :param env: envs
+        :return: them, in the VecNormalize of the training if that had one, which learns no more
+        """
+        statistics = self.record.get("normalize")
+        if statistics is not None:
+            normalize = VecNormalize(env, training=False, norm_reward=False, clip_obs=statistics["clip_obs"])
+            assert isinstance(normalize.obs_rms, RunningMeanStd)
+            normalize.obs_rms.mean, normalize.obs_rms.var = np.array(statistics["mean"]), np.array(statistics["var"])
+            normalize.epsilon = statistics["epsilon"]
+            return normalize
+        file = self.folder and self.folder / self.env_id / "vecnormalize.pkl"
+        if not file or not file.exists():
+            return env
+        normalize = VecNormalize.load(str(file), env)
+        normalize.training = False
+        return normalize
+
+    def normalize_statistics(self) -> dict[str, Any] | None:
+        """
+        :return: what :meth:`normalized` needs, as plain data; None if observations are not normalized
+        """
+        env = self.normalized(DummyVecEnv([self.make_env]))
+        if not isinstance(env, VecNormalize):
+            return None
+        rms = env.obs_rms
+        assert isinstance(rms, RunningMeanStd)
+        return {"mean": rms.mean.tolist(), "var": rms.var.tolist(), "clip_obs": env.clip_obs, "epsilon": env.epsilon}
+
+
+def find_runs(folder: Path) -> list[Path]:
+    """
+    :param folder: a run folder, or a folder with runs somewhere in it
+    :return: run folders, the oldest first
+    :raises FileNotFoundError: if there is none
+    """
+    runs = sorted(folder.rglob(RECORD), key=lambda path: path.stat().st_mtime)
+    if not runs:
+        raise FileNotFoundError(f"There is no run in {folder}: give the folder that `sb3-htr train` printed as 'Log path'.")
+    return [run.parent for run in runs]
+
+
+def find_run(folder: Path) -> Path:
+    """
+    :param folder: a run folder, or a folder with runs somewhere in it
+    :return: the run folder, the newest one
+    :raises FileNotFoundError: if there is none
+    """
+    return find_runs(folder)[-1]
+
+
+def find_model(run: Path, env_id: str, which: str) -> Path:
+    """
+    :param run: run folder
+    :param env_id: env that it was trained on
+    :param which: ``"best"`` or ``"last"``
+    :return: model file; the other one where the run has only that yet
+    :raises FileNotFoundError: if it has neither
+    """
+    best, last = run / "best_model.zip", run / f"{env_id}.zip"
+    for path in (best, last) if which == "best" else (last, best):
+        if path.exists():
+            return path
+    raise FileNotFoundError(
+        f"{run} has no model yet, the first is saved with the first evaluation: go on with `sb3-htr train --resume {run}`."
+    )
+
+
+def agent_at(path: Path, which: str = "best", env_id: str | None = None) -> TrainedAgent:
+    """
+    :param path: a run folder, a folder of runs, of which the newest is meant, an exported folder, or a model file
+    :param which: ``"best"`` or ``"last"`` model of a run
+    :param env_id: env of a model file without a record
+    :return: the agent
+    :raises FileNotFoundError: if there is none
+    :raises ValueError: if it is no model file, or one that does not say its env
+    """
+    files = list(path.glob("*.zip"))
+    if len(files) == 1 and not any(path.rglob(RECORD)):
+        path = files[0]
+    if path.is_dir():
+        run = find_run(path)
+        record = json.loads((run / RECORD).read_text())
+        return TrainedAgent(find_model(run, record["env_id"], which), record, run)
+    if not path.exists():
+        raise FileNotFoundError(f"There is no {path}: give a run folder, a folder of runs, or a model file (.zip).")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if RECORD in archive.namelist():
+                return TrainedAgent(path, json.loads(archive.read(RECORD)), None)
+    except zipfile.BadZipFile:
+        raise ValueError(f"{path} is no model file: give a run folder, or a .zip saved by PEARL.") from None
+    if (path.parent / RECORD).exists():
+        return TrainedAgent(path, json.loads((path.parent / RECORD).read_text()), path.parent)
+    if env_id is None:
+        raise ValueError(f"{path} does not say which env it was trained on: add --env ID.")
+    return TrainedAgent(path, {"env_id": env_id, "env_kwargs": {}, "gym_packages": []}, None)
+
+
+def agent_for(env_id: str, folder: Path, method: str | None = None, exp_id: int = 0, which: str = "best") -> TrainedAgent:
+    """
+    :param env_id: env
+    :param folder: log folder of ``sb3-htr train``, with the runs in ``<method>/<env_id>_<exp_id>``
+    :param method: ``"pearl"`` in a log folder, the name of a method for the agents that come with the package; any by default
+    :param exp_id: number of the run, 0 for the latest
+    :param which: ``"best"`` or ``"last"`` model of a run
+    :return: the agent, of the log folder if that has one, else the one that comes with the package
+    :raises FileNotFoundError: if there is none
+    """
+    methods = METHODS if method is None else (method,)
+    for name in methods:
+        runs = [path.parent for path in (folder / name).glob(f"{env_id}_*/{RECORD}") if _number(path.parent, env_id) > 0]
+        runs = sorted(runs, key=lambda run: _number(run, env_id), reverse=True)
+        for run in [run for run in runs if exp_id in (0, _number(run, env_id))]:
+            # A run that has no model yet is passed over, if it was not asked for
+            if exp_id or (run / "best_model.zip").exists() or (run / f"{env_id}.zip").exists():
+                return agent_at(run, which)
+    for name in methods if not exp_id else ():
+        file = shipped("trained_agents") / name / f"{env_id}.zip"
+        if file.exists():
+            return agent_at(file)
+    wanted = f"{env_id}" + (f" run {exp_id}" if exp_id else "") + (f" by {method}" if method else "")
+    with_agent = sorted(f"{file.stem} ({file.parent.name})" for file in shipped("trained_agents").glob("*/*.zip"))
+    raise FileNotFoundError(
+        f"There is no trained agent for {wanted} in {folder}/: train one with `sb3-htr train --env {env_id} -f {folder}`. "
+        f"The package comes with {', '.join(with_agent) or 'none'}."
+    )
+
+
+def _number(run: Path, env_id: str) -> int:
+    """Of a run folder, rl_zoo3's ``<env_id>_<number>``, or with a unique id behind it; 0 for another folder."""
+    number = run.name.removeprefix(f"{env_id}_").split("_")[0]
+    return int(number) if number.isdigit() else 0
+
+
+def import_packages(names: Sequence[str]) -> None:
+    """
+    :param names: modules that register envs
+    :raises ValueError: for one that is not there
+    """
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except ModuleNotFoundError as error:
+            if error.name != name.split(".")[0]:
+                raise
+            raise ValueError(
+                f"The env needs the module {name}, which is not found: install it, or add its folder to PYTHONPATH."
+            ) from None

@@ -1,0 +1,109 @@
+"""Arguments that the commands about a trained agent share, named as in rl_zoo3."""
+
+import argparse
+import ast
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from sb3_htr.pearl.exploration import Explorer
+from sb3_htr.zoo.agents import TrainedAgent, agent_at, agent_for, import_packages
+
+TASK_SETS = ("test", "validation", "train")
+
+
+class KeyValues(argparse.Action):
+    """``key:value ...``, where a value is a Python literal, or else text."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        pairs = {}
+        for text in values:
+            key, colon, value = text.partition(":")
+            if not colon:
+                parser.error(f"{option_string} has {text!r}, expected key:value")
+            try:
+                pairs[key] = ast.literal_eval(value)
+            except (ValueError, SyntaxError):
+                pairs[key] = value
+        setattr(namespace, self.dest, pairs)
+
+
+def make_parser(command: str, description: str, example: str) -> argparse.ArgumentParser:
+    """
+    :param command: name of the command
+    :param description: what it does
+    :param example: command lines
+    :return: parser without arguments
+    """
+    return argparse.ArgumentParser(
+        prog=f"sb3-htr {command}",
+        description=description,
+        epilog=f"examples:\n{example}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def add_agent_arguments(parser: argparse.ArgumentParser, several: bool = False) -> None:
+    """
+    :param parser: gets the arguments that say which agent is meant
+    :param several: whether more than one may be given
+    """
+    what = "run folder, folder of runs (the newest is taken), or model file; or give --env"
+    if several:
+        what = "run folder, folder of runs (the seeds of one curve), or model file; or give --env"
+    parser.add_argument("agent", nargs="*" if several else "?", type=Path, help=what)
+    group = parser.add_argument_group("which agent")
+    group.add_argument("--env", metavar="ID", help="look for an agent of this env in the log folder, then in trained_agents/")
+    group.add_argument("-f", "--folder", type=Path, default=Path("logs"), help="log folder (default: logs)")
+    group.add_argument("--exp-id", type=int, default=0, metavar="N", help="number of the run, 0 (default) for the latest")
+    group.add_argument("--algo", metavar="METHOD", help="pearl, or a method in trained_agents/ such as htr-ser")
+    group.add_argument("--model", choices=["best", "last"], default="best", help="of a run: best on validation tasks, or last")
+    group.add_argument("--load-best", dest="model", action="store_const", const="best", help="the same as --model best")
+    group.add_argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules that register envs")
+    group.add_argument(
+        "--env-kwargs", nargs="+", action=KeyValues, default={}, metavar="KEY:VALUE", help="change arguments of the env"
+    )
+    group.add_argument("--device", default="cpu", help="torch device (default: cpu)")
+
+
+def add_adaptation_arguments(parser: argparse.ArgumentParser, n_episodes: int) -> None:
+    """
+    :param parser: gets the arguments that say how to adapt
+    :param n_episodes: default of the number of episodes
+    """
+    group = parser.add_argument_group("adaptation")
+    group.add_argument("--tasks", choices=TASK_SETS, default="test", help="set of tasks to adapt to (default: test)")
+    group.add_argument("--n-episodes", type=int, default=n_episodes, metavar="N", help=f"per task (default: {n_episodes})")
+    group.add_argument("--explorer", choices=[e.value for e in Explorer], help="by default the model's own")
+    group.add_argument("--stochastic", action="store_true", help="sample actions instead of taking their mean")
+    group.add_argument("--seed", type=int, default=0, help="of env and z (default: 0)")
+
+
+def chosen_agent(parser: argparse.ArgumentParser, args: argparse.Namespace, path: Path | None) -> TrainedAgent:
+    """
+    :param parser: for the message if arguments are missing
+    :param args: of :func:`add_agent_arguments`
+    :param path: what was given as agent, if anything
+    :return: the agent; its env is registered
+    """
+    import_packages(args.gym_packages)
+    if path is not None:
+        agent = agent_at(path, args.model, args.env)
+    elif args.env is not None:
+        agent = agent_for(args.env, args.folder, args.algo, args.exp_id, args.model)
+    else:
+        parser.error("say which agent: a run folder or model file, or --env ID")
+    import_packages(agent.record["gym_packages"])
+    kwargs = {**agent.record["env_kwargs"], **args.env_kwargs}
+    return dataclasses.replace(agent, record={**agent.record, "env_kwargs": kwargs})
+
+
+def parse(parser: argparse.ArgumentParser, argv: Sequence[str]) -> tuple[argparse.Namespace, TrainedAgent]:
+    """
+    :param parser: with the arguments of :func:`add_agent_arguments`, for one agent
+    :param argv: arguments of the command
+    :return: them, parsed, and the agent that they name
+    """
+    args = parser.parse_args(argv)
+    return args, chosen_agent(parser, args, args.agent)

@@ -1,0 +1,135 @@
+"""``sb3-htr enjoy``: watch a trained agent adapt."""
+
+import argparse
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_htr.common.checks import get_task_family
+from sb3_htr.zoo.agents import TrainedAgent
+from sb3_htr.zoo.arguments import add_adaptation_arguments, add_agent_arguments, make_parser, parse
+from sb3_htr.zoo.play import Moment, Player, heading, line, summary
+
+if TYPE_CHECKING:
+    from sb3_htr.zoo.captions import Captioner
+    from sb3_htr.zoo.window import Window
+
+EXAMPLE = """  sb3-htr enjoy --env SparsePointRobot-v0              an agent that comes with the package, or yours in logs/
+  sb3-htr enjoy runs/pearl/SparsePointRobot-v0_1 --task 3 7
+  sb3-htr enjoy --env SparsePointRobot-v0 -f runs --no-render --explorer prior"""
+
+# Shows the env as it is at a moment; False to stop
+Show = Callable[[gym.Env, Moment], bool]
+
+
+def add_task_arguments(parser: argparse.ArgumentParser) -> None:
+    """
+    :param parser: gets the arguments that say which tasks to play
+    """
+    add_adaptation_arguments(parser, n_episodes=8)
+    group = parser.add_argument_group("tasks")
+    group.add_argument("--n-tasks", type=int, default=3, metavar="N", help="the first N of the set (default: 3)")
+    group.add_argument("--task", type=int, nargs="+", metavar="N", help="numbers of tasks in the set, from 1 on")
+    group.add_argument("-n", "--n-timesteps", type=int, metavar="N", help="stop after N steps (default: play all tasks)")
+    group.add_argument("--verbose", type=int, default=1, help="0 prints nothing, 1 (default) a line for each episode")
+
+
+def watch(agent: TrainedAgent, args: argparse.Namespace, render_mode: str | None, show: Show) -> list[Moment]:
+    """
+    Play the tasks that the arguments name, and print what happens.
+
+    :param agent: who plays
+    :param args: of :func:`add_task_arguments`
+    :param render_mode: of the env
+    :param show: called at every reset and step
+    :return: last moment of each task
+    :raises ValueError: for a task or a number of episodes that there is not
+    """
+    model = agent.load(args.device)
+    env = agent.make_env(render_mode)
+    # The wrapper knows how to normalize, but resets by itself: frames of an episode's end would be lost
+    vec_env = agent.normalized(DummyVecEnv([lambda: env]))
+    tasks: np.ndarray = getattr(get_task_family(vec_env), f"{args.tasks}_tasks")
+    if args.n_episodes < 1:
+        raise ValueError(f"--n-episodes is {args.n_episodes}, expected at least 1.")
+    numbers = args.task or range(1, min(args.n_tasks, len(tasks)) + 1)
+    wrong = [number for number in numbers if not 1 <= number <= len(tasks)]
+    if wrong:
+        raise ValueError(f"There is no {args.tasks} task {wrong[0]}: --task takes numbers from 1 to {len(tasks)}.")
+    normalize = vec_env.normalize_obs if isinstance(vec_env, VecNormalize) else lambda obs: obs
+    say = print if args.verbose > 0 else lambda text: None
+    say(f"{agent.path}: {agent.env_id}, explorer {args.explorer or model.explorer!r}")
+    player = Player(model, env, normalize, args.explorer, not args.stochastic, args.seed)
+    ends: list[Moment] = []
+    n_steps, going_on = 0, True
+    for number in numbers:
+        say(heading(tasks, args.tasks, number))
+        for moment in player.play(tasks, number, args.n_episodes):
+            n_steps += moment.step > 0
+            going_on = show(env, moment) and (args.n_timesteps is None or n_steps < args.n_timesteps)
+            if moment.ended:
+                say(line(moment))
+            if not going_on:
+                break
+        ends.append(moment)
+        if not going_on:
+            break
+    env.close()
+    say(summary(ends))
+    return ends
+
+
+def can_be_drawn(agent: TrainedAgent) -> bool:
+    """
+    :param agent: whose env is meant
+    :return: whether the env makes pictures
+    """
+    return "rgb_array" in agent.make_env().metadata.get("render_modes", ())
+
+
+def main(argv: Sequence[str]) -> None:
+    """
+    :param argv: arguments of the command
+    """
+    parser = make_parser("enjoy", "Watch a trained agent adapt to tasks that it has not seen, one after the other.", EXAMPLE)
+    add_agent_arguments(parser)
+    add_task_arguments(parser)
+    parser.add_argument("--no-render", action="store_true", help="numbers only")
+    parser.add_argument("--fps", type=float, help="frames per second (default: the env's)")
+    args, agent = parse(parser, argv)
+    window, captioner = (None, None) if args.no_render else _open_window(agent, args.fps)
+
+    def show(env: gym.Env, moment: Moment) -> bool:
+        if window is None or captioner is None:
+            return True
+        frame = env.render()
+        assert isinstance(frame, np.ndarray)
+        return window.show(captioner(frame, moment))
+
+    try:
+        watch(agent, args, None if window is None else "rgb_array", show)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        if window is not None:
+            window.close()
+
+
+def _open_window(agent: TrainedAgent, fps: float | None) -> "tuple[Window, Captioner] | tuple[None, None]":
+    """None, and a sentence for the user, where no window can be opened."""
+    reason = "the env makes no pictures"
+    if can_be_drawn(agent):
+        try:
+            from sb3_htr.zoo.captions import Captioner
+            from sb3_htr.zoo.window import Window
+
+            return Window(f"sb3-htr enjoy {agent.env_id}", fps or agent.make_env().metadata.get("render_fps", 30)), Captioner()
+        except ModuleNotFoundError as error:
+            reason = f"{error.name} is not installed (pip install 'sb3_htr[plots]')"
+        except (OSError, ImportError) as error:
+            reason = str(error)
+    print(f"Numbers only: {reason}. `sb3-htr record` films without a screen.")
+    return None, None

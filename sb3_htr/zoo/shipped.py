@@ -1,0 +1,22 @@
+"""Where the files are that come with the package."""
+
+from pathlib import Path
+
+PACKAGE = Path(__file__).parents[1]
+
+
+def shipped(name: str) -> Path:
+    """
+    :param name: folder at the top of the repository
+    :return: its path: inside the installed package, or beside it in a checkout
+    """
+    inside = PACKAGE / name
+    return inside if inside.is_dir() else PACKAGE.parent / name
+
+
+def hyperparams_file(name: str = "pearl.yml") -> Path:
+    """
+    :param name: file name
+    :return: its path
+    """
+    return shipped("hyperparams") / name
