@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from sb3_htr.experiments import goal_distance, point_robot, relabelling, report, tables, target_speed
-from sb3_htr.experiments.report import Plot, episodes_to_first_success, iqm_difference, iqm_interval, loss_of_stability
+from sb3_htr.experiments.report import Plot, episodes_to_first_success, loss_of_stability
 from sb3_htr.experiments.runner import LOGGED, Cell
+from sb3_htr.zoo import intervals
+from sb3_htr.zoo.intervals import iqm_difference, iqm_interval
 
 EXPERIMENTS: dict[str, tuple[Callable[[int, int], list[Cell]], Plot]] = {
     "point_robot": (point_robot.cells, report.plot_learning),
@@ -43,7 +45,7 @@ def made_up(cells: list[Cell], folder: Path) -> dict[Cell, Path]:
 def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cells, plot = EXPERIMENTS[name]
     monkeypatch.setattr(report, "RESULTS", tmp_path / "results")
-    monkeypatch.setattr(report, "REPS", 50)
+    monkeypatch.setattr(intervals, "REPS", 50)
     folder = report.write(name, made_up(cells(3, 20_000), tmp_path), plot)
     assert (folder / f"{name}.png").stat().st_size > 10_000
     assert len(np.load(folder / "raw.npz").files) > 10

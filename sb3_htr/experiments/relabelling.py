@@ -8,8 +8,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from sb3_htr.experiments.command import run_experiment
-from sb3_htr.experiments.report import COLOURS, band, finish, iqm_interval
 from sb3_htr.experiments.runner import Cell
+from sb3_htr.zoo.curves import band, finish
+from sb3_htr.zoo.intervals import iqm_interval
+from sb3_htr.zoo.plots import COLOURS
 
 ENV_ID = "SparsePointRobot-v0"
 # The paper's sweep, and no relabelling

@@ -8,53 +8,19 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.figure import Figure
-from rliable import library, metrics
 
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.experiments.runner import LOGGED, Cell
+from sb3_htr.zoo.curves import band, finish
+from sb3_htr.zoo.intervals import iqm_difference, iqm_interval
+from sb3_htr.zoo.plots import COLOURS
 
 RESULTS = Path(__file__).parents[2] / "results"
-# Bootstrap samples
-REPS = 2000
-# Okabe and Ito's colours
-COLOURS = ["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999"]
 
 # Draws the results of all cells into a file
 Plot = Callable[[dict[Cell, Path], Path], None]
-
-
-def iqm_interval(scores: np.ndarray) -> tuple[float, float, float]:
-    """
-    :param scores: (n_seeds,) one score per run
-    :return: interquartile mean over runs, and its 95 % stratified bootstrap interval
-    """
-    np.random.seed(0)  # rliable hands its random_state on to a library that has come to ignore it
-    estimates, intervals = library.get_interval_estimates(
-        {"": scores[:, None]}, lambda x: np.array([metrics.aggregate_iqm(x)]), reps=REPS
-    )
-    return float(estimates[""][0]), float(intervals[""][0, 0]), float(intervals[""][1, 0])
-
-
-def iqm_difference(scores: np.ndarray, reference: np.ndarray) -> tuple[float, float, float]:
-    """
-    :param scores: (n_seeds,) one score per run
-    :param reference: (n_seeds,) the same of another method
-    :return: difference of the interquartile means over runs, and its 95 % stratified bootstrap interval
-    """
-    np.random.seed(0)
-    estimates, intervals = library.get_interval_estimates(
-        {"": (scores[:, None], reference[:, None])},
-        lambda x, y: np.array([metrics.aggregate_iqm(x) - metrics.aggregate_iqm(y)]),
-        reps=REPS,
-    )
-    return float(estimates[""][0]), float(intervals[""][0, 0]), float(intervals[""][1, 0])
 
 
 def loss_of_stability(curve: np.ndarray) -> float:
@@ -182,35 +148,3 @@ def plot_learning(results: dict[Cell, Path], path: Path) -> None:
     right.set_title("test tasks, final models", fontsize=10)
     n_seeds = len(next(iter(groups.values())))
     finish(figure, path, f"{next(iter(results)).env_id}: IQM over {n_seeds} seeds, 95 % interval")
-
-
-def finish(figure: Figure, path: Path, title: str) -> None:
-    """
-    :param figure: to make alike all others, and to save
-    :param path: picture to write
-    :param title: of the figure
-    """
-    for axes in figure.axes:
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(alpha=0.25)
-        axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=2)
-    figure.suptitle(title, fontsize=11)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=110)
-    plt.close(figure)
-
-
-def band(axes: plt.Axes, x: np.ndarray, scores: np.ndarray, colour: str, style: str, label: str) -> None:
-    """
-    Draw the IQM over runs at each x, with its interval.
-
-    :param axes: where
-    :param x: (n,)
-    :param scores: (n_runs, n)
-    :param colour: of line and band
-    :param style: of the line, matplotlib's
-    :param label: for the legend
-    """
-    points = np.array([iqm_interval(column) for column in scores.T])
-    axes.plot(x, points[:, 0], style, color=colour, label=label)
-    axes.fill_between(x, points[:, 1], points[:, 2], color=colour, alpha=0.2, linewidth=0)

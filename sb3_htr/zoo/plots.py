@@ -1,4 +1,4 @@
-"""Pictures of an adaptation."""
+"""Pictures of the adaptations of one agent."""
 
 from pathlib import Path
 
@@ -14,10 +14,15 @@ from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.evaluation import AdaptationRecord
 
 # Okabe and Ito's colours, told apart by all kinds of colour vision
-BLUE, ORANGE, GREEN, GREY = "#0072B2", "#E69F00", "#009E73", "#999999"
+COLOURS = ["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999"]
+BLUE, ORANGE, GREEN, GREY = *COLOURS[:3], COLOURS[6]
 
 
-def _save(figure: plt.Figure, path: Path) -> None:
+def save(figure: plt.Figure, path: Path) -> None:
+    """
+    :param figure: to save and close
+    :param path: picture to write
+    """
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=120, bbox_inches="tight")
     plt.close(figure)
@@ -51,7 +56,7 @@ def plot_adaptation_curve(record: AdaptationRecord, path: Path, title: str) -> N
     for axes in (top, bottom):
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.25)
-    _save(figure, path)
+    save(figure, path)
 
 
 def plot_adaptation_paths(
@@ -97,7 +102,7 @@ def plot_adaptation_paths(
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
     for axes in grid[-1]:
-        axes.set_xlabel("x")
+        axes.set_xlabel("x (length)")
     for axes in grid[:, 0]:
-        axes.set_ylabel("y")
-    _save(figure, path)
+        axes.set_ylabel("y (length)")
+    save(figure, path)

@@ -1,0 +1,79 @@
+"""Curves over several runs: interquartile mean and interval."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+from sb3_htr.zoo.intervals import iqm_interval
+from sb3_htr.zoo.plots import COLOURS, save
+
+
+def band(axes: plt.Axes, x: np.ndarray, scores: np.ndarray, colour: str, style: str, label: str) -> None:
+    """
+    Draw the IQM over runs at each x, with its interval.
+
+    :param axes: where
+    :param x: (n,)
+    :param scores: (n_runs, n)
+    :param colour: of line and band
+    :param style: of the line, matplotlib's
+    :param label: for the legend
+    """
+    points = np.array([iqm_interval(column) for column in scores.T])
+    axes.plot(x, points[:, 0], style, color=colour, label=label)
+    axes.fill_between(x, points[:, 1], points[:, 2], color=colour, alpha=0.2, linewidth=0)
+
+
+def finish(figure: Figure, path: Path, title: str) -> None:
+    """
+    :param figure: to make alike all others, and to save
+    :param path: picture to write
+    :param title: of the figure
+    """
+    for axes in figure.axes:
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(alpha=0.25)
+        axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=2)
+    figure.suptitle(title, fontsize=11)
+    save(figure, path)
+
+
+class Curve(NamedTuple):
+    """
+    What several runs did, at each of n points.
+
+    :param x: (n,)
+    :param returns: (n_runs, n)
+    :param successes: (n_runs, n), share of tasks solved
+    """
+
+    x: np.ndarray
+    returns: np.ndarray
+    successes: np.ndarray
+
+
+def plot_curves(curves: dict[str, Curve], path: Path, title: str, x_label: str, y_labels: tuple[str, str]) -> None:
+    """
+    Left: returns. Right: tasks solved.
+
+    :param curves: label and curve
+    :param path: picture to write
+    :param title: of the figure
+    :param x_label: of both axes
+    :param y_labels: of returns and successes
+    """
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4.2), layout="constrained")
+    for i, (label, curve) in enumerate(curves.items()):
+        colour, style = COLOURS[i % len(COLOURS)], ("-", "--", ":")[i // len(COLOURS) % 3]
+        label = f"{label} ({len(curve.returns)} seed{'s' * (len(curve.returns) > 1)})"
+        band(left, curve.x, curve.returns, colour, style, label)
+        band(right, curve.x, 100 * curve.successes, colour, style, label)
+    right.set_ylim(-4, 104)
+    for axes, y_label in zip((left, right), y_labels, strict=True):
+        axes.set_xlabel(x_label)
+        axes.set_ylabel(y_label)
+    interval = any(len(curve.returns) > 1 for curve in curves.values())
+    finish(figure, path, f"{title}{': IQM over seeds, 95 % interval' if interval else ''}")

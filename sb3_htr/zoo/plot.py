@@ -1,0 +1,185 @@
+"""``sb3-htr plot``: pictures of one or several runs."""
+
+import argparse
+from collections.abc import Callable, Sequence
+from functools import reduce
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch as th
+
+from sb3_htr.common.checks import get_task_family
+from sb3_htr.common.evaluation import AdaptationRecord, run_adaptation
+from sb3_htr.zoo.agents import TrainedAgent, find_runs
+from sb3_htr.zoo.arguments import add_adaptation_arguments, add_agent_arguments, chosen_agent, make_parser
+from sb3_htr.zoo.curves import Curve, plot_curves
+from sb3_htr.zoo.latent import plot_latent_space
+from sb3_htr.zoo.plots import plot_adaptation_curve, plot_adaptation_paths
+
+EXAMPLE = """  sb3-htr plot --env SparsePointRobot-v0                  an agent that comes with the package
+  sb3-htr plot runs/htr runs/sparse -l HTR "no relabelling"    the runs in a folder are the seeds of its curve
+  sb3-htr plot runs --only learning -o pictures"""
+PICTURES = ("learning", "adaptation", "paths", "latent")
+
+
+class Adapted(NamedTuple):
+    """
+    Adaptations of one agent to a set of tasks.
+
+    :param tasks: (n_tasks, task_dim)
+    :param goal_radius: radius of the goals, if the tasks are places with one
+    :param record: what happened
+    :param mean: (n_tasks, latent_dim), posterior means after the last episode
+    :param deviation: (n_tasks, latent_dim), their standard deviations
+    :param found: (n_tasks,) bool, whether there is a posterior: the reward of the task was found
+    :param known_z: (m, latent_dim), z of training tasks
+    """
+
+    tasks: np.ndarray
+    goal_radius: float | None
+    record: AdaptationRecord
+    mean: np.ndarray
+    deviation: np.ndarray
+    found: np.ndarray
+    known_z: np.ndarray
+
+
+def adapt(agent: TrainedAgent, args: argparse.Namespace) -> Adapted:
+    """
+    :param agent: to adapt to all tasks of a set
+    :param args: which set, and how
+    :return: what happened
+    """
+    model = agent.load(args.device)
+    family = get_task_family(agent.make_vec_env(1))
+    tasks: np.ndarray = getattr(family, f"{args.tasks}_tasks")
+    env = agent.make_vec_env(len(tasks))
+    env.seed(args.seed)
+    env.set_options([{"task": task} for task in tasks])
+    adaptation = model.start_adaptation(len(tasks), None, args.explorer, th.Generator().manual_seed(args.seed))
+    record = run_adaptation(model.policy, env, adaptation, args.n_episodes, deterministic=not args.stochastic)
+    known_z = model.policy.latent_prior.known_tasks().z
+    radius = getattr(family, "goal_radius", None)
+    return Adapted(tasks, radius, record, *adaptation.posterior(), ~adaptation.exploring(), known_z)
+
+
+def groups_of(parser: argparse.ArgumentParser, args: argparse.Namespace) -> dict[str, list[TrainedAgent]]:
+    """
+    :param parser: for messages
+    :param args: of the command
+    :return: label and runs of each curve
+    :raises ValueError: for runs that do not belong on one curve, or in one picture
+    """
+    labels = args.labels or [path.stem if path.suffix == ".zip" else path.name for path in args.agent] or [args.env]
+    if len(labels) != max(len(args.agent), 1) or len(set(labels)) < len(labels):
+        raise ValueError(f"--labels needs one name of its own for each of the {len(args.agent)} folders, got {labels}.")
+    groups: dict[str, list[TrainedAgent]] = {}
+    for label, path in zip(labels, args.agent or [None], strict=True):
+        is_folder_of_runs = path is not None and path.is_dir() and not list(path.glob("*.zip"))
+        paths = find_runs(path) if is_folder_of_runs else [path]
+        groups[label] = [chosen_agent(parser, args, path) for path in paths]
+        check_same_settings(label, groups[label])
+    envs = {agent.env_id for agents in groups.values() for agent in agents}
+    if len(envs) > 1:
+        raise ValueError(f"These runs are of several envs, {', '.join(sorted(envs))}: plot one env at a time.")
+    return groups
+
+
+def check_same_settings(label: str, agents: Sequence[TrainedAgent]) -> None:
+    """
+    :param label: of the curve
+    :param agents: runs that should differ in their seed alone
+    :raises ValueError: if they differ in anything else
+    """
+    settings = [{**agent.record.get("hyperparams", {}), "env_kwargs": agent.record["env_kwargs"]} for agent in agents]
+    different = {key for other in settings for key in {*settings[0], *other} if settings[0].get(key) != other.get(key)}
+    if different:
+        raise ValueError(
+            f"The runs in {label} differ in {sorted(different)}: put them into folders of their own, one per curve."
+        )
+
+
+def learning_curve(label: str, agents: Sequence[TrainedAgent]) -> Curve | None:
+    """
+    :param label: of the curve
+    :param agents: runs
+    :return: last adaptation episode on the validation tasks, at the env steps at which all of them were evaluated; None where
+        there are no evaluations, as for the agents that come with the package
+    :raises ValueError: if they have no evaluation in common
+    """
+    files = [agent.folder / "evaluations.npz" for agent in agents if agent.folder is not None]
+    runs = [np.load(file) for file in files if file.exists()]
+    if not runs:
+        return None
+    steps = reduce(np.intersect1d, [run["timesteps"] for run in runs])
+    if len(steps) == 0:
+        raise ValueError(f"The runs in {label} were never evaluated at the same env step: train them with one --eval-freq.")
+    at = [np.isin(run["timesteps"], steps) for run in runs]
+    returns = np.stack([run["returns"][i][:, :, -1].mean(axis=1) for run, i in zip(runs, at, strict=True)])
+    successes = np.stack([run["successes"][i][:, :, -1].mean(axis=1) for run, i in zip(runs, at, strict=True)])
+    return Curve(steps / 1000, returns, successes)
+
+
+def main(argv: Sequence[str]) -> None:
+    """
+    :param argv: arguments of the command
+    """
+    description = "Pictures of one or several runs: learning curves, return per adaptation episode, paths, latent space."
+    parser = make_parser("plot", description, EXAMPLE)
+    add_agent_arguments(parser, several=True)
+    add_adaptation_arguments(parser, n_episodes=20)
+    parser.add_argument("-l", "--labels", nargs="+", metavar="NAME", help="names of the curves (default: the folders')")
+    parser.add_argument("-o", "--output", type=Path, default=Path("plots"), help="folder for the pictures (default: plots)")
+    parser.add_argument("--only", nargs="+", choices=PICTURES, default=PICTURES, help="pictures to draw (default: all)")
+    args = parser.parse_args(argv)
+    groups = groups_of(parser, args)
+    env_id = next(iter(groups.values()))[0].env_id
+    written: list[Path] = []
+
+    def new(name: str) -> Path:
+        written.append(args.output / name)
+        return written[-1]
+
+    if "learning" in args.only:
+        learning = {label: curve for label, agents in groups.items() if (curve := learning_curve(label, agents)) is not None}
+        labels = ("return of the last adaptation episode", "validation tasks solved in it (%)")
+        if learning:
+            plot_curves(learning, new("learning_curves.png"), env_id, "thousand env steps of meta-training", labels)
+        else:
+            print("No learning curves: there is no evaluations.npz of a training.")
+    if set(args.only) != {"learning"}:
+        adapted = {label: [adapt(agent, args) for agent in agents] for label, agents in groups.items()}
+        plot_adapted(args, env_id, adapted, new)
+    print("Pictures: " + (", ".join(str(path) for path in written) or "none"))
+
+
+def plot_adapted(args: argparse.Namespace, env_id: str, adapted: dict[str, list[Adapted]], new: Callable[[str], Path]) -> None:
+    """
+    :param args: of the command
+    :param env_id: env
+    :param adapted: label and adaptations of the runs of each curve
+    :param new: gives the path of a picture
+    """
+    label, first = next((label, runs[0]) for label, runs in adapted.items())
+    about = f"{env_id}, {len(first.tasks)} {args.tasks} tasks"
+    if "adaptation" in args.only:
+        if sum(map(len, adapted.values())) == 1:
+            plot_adaptation_curve(first.record, new("adaptation_curve.png"), about)
+        else:
+            curves = {}
+            for name, runs in adapted.items():
+                returns = np.stack([run.record.returns.mean(axis=0) for run in runs])
+                successes = np.stack([run.record.successes.mean(axis=0) for run in runs])
+                curves[name] = Curve(np.arange(1, args.n_episodes + 1), returns, successes)
+            labels = ("return", "tasks solved in the episode (%)")
+            plot_curves(curves, new("adaptation_curve.png"), about, "adaptation episode", labels)
+    if "paths" in args.only and first.tasks.shape[1] == 2:
+        plot_adaptation_paths(first.record, first.tasks, first.goal_radius, new("adaptation_paths.png"))
+    found = first.found
+    if "latent" in args.only and found.sum() < 2:
+        print(f"No latent space: {label} found the reward of {found.sum()} of {len(found)} tasks.")
+    elif "latent" in args.only:
+        tasks, posterior = first.tasks[found], (first.mean[found], first.deviation[found])
+        title = f"{env_id}: posteriors of {found.sum()} {args.tasks} tasks"
+        plot_latent_space(tasks, *posterior, first.known_z, new("latent_space.png"), title)
