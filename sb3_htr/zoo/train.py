@@ -5,6 +5,7 @@ import json
 import signal
 import sys
 import threading
+from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime, timezone
@@ -14,9 +15,11 @@ from types import ModuleType
 from typing import Any
 
 import gymnasium as gym
+import optuna
 import rl_zoo3.train
 from rl_zoo3 import exp_manager
 from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS, SimpleLinearSchedule
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -32,6 +35,7 @@ from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.pearl.resume import CheckpointCallback, checkpoints, cut_monitor_files, load_latest
 from sb3_htr.zoo.agents import find_run
+from sb3_htr.zoo.search_space import convert_pearl_params, sample_pearl_params
 from sb3_htr.zoo.shipped import hyperparams_file
 from sb3_htr.zoo.yaml_values import without_code
 
@@ -40,6 +44,17 @@ PACKAGES = ("sb3_htr", "stable_baselines3", "gymnasium", "rl_zoo3", "torch", "nu
 ZOO_SETTINGS = ("n_envs", "n_timesteps", "normalize", "env_wrapper", "vec_env_wrapper", "callback", "env_kwargs")
 # Tasks that an evaluation adapts to side by side
 N_EVAL_ENVS = 20
+HELP = """sb3-htr train: rl_zoo3's train (its arguments follow) with PEARL and evaluations that adapt to validation tasks.
+
+examples:
+  sb3-htr train --env SparsePointRobot-v0 -P
+  sb3-htr train --env SparsePointRobot-v0 -f runs --seed 1 -params gamma:0.95 "policy_kwargs:{'latent_dim':3}"
+  sb3-htr train --resume runs/pearl/SparsePointRobot-v0_1
+
+defaults here: --algo pearl -conf hyperparams/pearl.yml (of this package) --num-threads 1 --save-freq 20000
+beside rl_zoo3's: --resume RUN  go on with a run from its latest checkpoint, exactly; takes no other arguments
+no effect here: --eval-episodes and --n-eval-envs (an evaluation adapts to each validation task once, in 20 episodes)
+"""
 
 
 class MetaExperimentManager(ExperimentManager):
@@ -49,6 +64,24 @@ class MetaExperimentManager(ExperimentManager):
 
     # Folder of the run that goes on, None for a new one
     resumed: Path | None = None
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """
+        rl_zoo3's; but settings of a trial (``--trial-id``) join those of the file where both are dicts, instead of replacing
+        them all, and trial 0 can be asked for.
+
+        :return: hyperparameters, and the same sorted to be saved
+        """
+        trial_id, self.trial_id = self.trial_id, None
+        hyperparams, saved = super().read_hyperparameters()
+        if self.storage and self.study_name and trial_id is not None:
+            trial = self.load_trial(self.storage, self.study_name, trial_id)
+            for key in trial.keys() - (self.custom_hyperparams or {}).keys():
+                value, given = trial[key], hyperparams.get(key)
+                hyperparams[key] = {**given, **value} if isinstance(value, dict) and isinstance(given, dict) else value
+            saved = OrderedDict(sorted(hyperparams.items()))
+            print(f"With those of trial {trial_id}: {trial}")
+        return hyperparams, saved
 
     def _preprocess_hyperparams(
         self, hyperparams: dict[str, Any]
@@ -76,6 +109,8 @@ class MetaExperimentManager(ExperimentManager):
         :return: the envs, batched if the registration offers that and no wrapper of single envs is asked for
         """
         spec = gym.spec(self.env_name.gym_id)
+        # A search makes envs for a look at their spaces too, which is no run to be logged
+        no_log = no_log or self.optimize_hyperparameters
         if spec.vector_entry_point is None or self.env_wrapper is not None or self.args.vec_env == "subproc":
             return super().create_envs(n_envs, eval_env, no_log)
         env = make_task_vec_env(
@@ -90,7 +125,9 @@ class MetaExperimentManager(ExperimentManager):
         return self._maybe_normalize(env, eval_env)
 
     def create_log_folder(self) -> None:
-        """Make the run's folder, or take the one of the run that goes on."""
+        """Make the run's folder, or take the one of the run that goes on; a search has none."""
+        if self.optimize_hyperparameters:
+            return
         if self.resumed is not None:
             self.save_path = str(self.resumed)
             self.params_path = f"{self.save_path}/{self.env_name}"
@@ -135,6 +172,18 @@ class MetaExperimentManager(ExperimentManager):
                 assert model.env is not None
                 model.env.close()
 
+    def objective(self, trial: optuna.Trial) -> float:
+        """
+        :param trial: gives the hyperparameters
+        :return: mean return of the last adaptation episode on the validation tasks
+        :raises optuna.TrialPruned: for hyperparameters that promise little or diverge
+        """
+        try:
+            return super().objective(trial)
+        except DivergedError as error:
+            print(f"Trial {trial.number} is pruned: {error}")
+            raise optuna.TrialPruned from error
+
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
         if self.resumed is not None:
             before = json.loads((self.resumed / "run.json").read_text())["hyperparams"]
@@ -174,6 +223,8 @@ def _is_installed(name: str) -> bool:
 def register() -> None:
     """Make PEARL known to rl_zoo3, in this process."""
     ALGOS["pearl"] = PEARL
+    HYPERPARAMS_SAMPLER["pearl"] = sample_pearl_params
+    HYPERPARAMS_CONVERTER["pearl"] = convert_pearl_params
     # rl_zoo3 looks these names up when it needs them
     replaced: dict[ModuleType, dict[str, type]] = {
         exp_manager: {
@@ -228,6 +279,8 @@ def main(argv: Sequence[str]) -> None:
         and the folder of a run, which goes on from its latest checkpoint
     """
     register()
+    if {"-h", "--help"} & set(argv):
+        print(HELP)
     arguments, run = _arguments(argv)
     before, sys.argv = sys.argv, ["sb3-htr train", *arguments]
     MetaExperimentManager.resumed = run

@@ -1,0 +1,88 @@
+"""``sb3-htr optimize``: search for hyperparameters with rl_zoo3 and Optuna."""
+
+import argparse
+import importlib
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import optuna
+import sqlalchemy
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
+
+from sb3_htr.zoo import train
+
+HELP = """sb3-htr optimize: rl_zoo3's `train -optimize` (its arguments follow) for PEARL, with Optuna.
+
+The objective is the mean return of the last adaptation episode on the validation tasks; the test tasks stay unseen.
+The search space is in sb3_htr/zoo/search_space.py; what it does not name stays as in the YAML file.
+
+examples:
+  sb3-htr optimize --env SparsePointRobot-v0 -n 40000 --n-trials 20
+  sb3-htr optimize --env SparsePointRobot-v0 -n 40000 --study-name htr --storage sqlite:///study.db --max-total-trials 50
+  sb3-htr optimize ... --study-name htr --storage postgresql+psycopg://user:password@host/database
+  sb3-htr train --env SparsePointRobot-v0 --study-name htr --storage sqlite:///study.db --trial-id 7
+
+storages: sqlite:///FILE on one machine, postgresql+psycopg://... on several (pip install 'sb3_htr[postgresql]'), FILE.log on a
+shared folder. Start the same command as often as you like: the workers share the study. Without --storage, it is not kept.
+defaults here: --n-evaluations 5 (of each trial, for pruning), and those of sb3-htr train
+"""
+# Workers that begin at once make the same tables, and all but one fail
+ATTEMPTS, PAUSE = 6, 0.5
+
+
+def create_study(storage: str, name: str) -> optuna.Study:
+    """
+    Make the study if there is none yet, several workers at once if need be.
+
+    :param storage: file of a journal (``.log``), or URL of a database
+    :param name: of the study
+    :return: the study
+    :raises ValueError: if the database cannot be used
+    """
+    if storage.endswith(".log"):
+        Path(storage).parent.mkdir(parents=True, exist_ok=True)
+        journal = JournalStorage(JournalFileBackend(storage))
+        return optuna.create_study(study_name=name, storage=journal, direction="maximize", load_if_exists=True)
+    try:
+        url = sqlalchemy.make_url(storage)
+    except sqlalchemy.exc.ArgumentError:
+        raise ValueError(
+            f"--storage is {storage!r}, expected sqlite:///FILE, postgresql+psycopg://USER:PASSWORD@HOST/DATABASE or FILE.log."
+        ) from None
+    if url.get_backend_name() == "postgresql":
+        importlib.import_module(url.get_driver_name())
+    attempt = 1
+    while True:
+        try:
+            return optuna.create_study(study_name=name, storage=storage, direction="maximize", load_if_exists=True)
+        except sqlalchemy.exc.SQLAlchemyError as error:
+            if attempt == ATTEMPTS:
+                reason = " ".join(str(getattr(error, "orig", None) or error).split())
+                raise ValueError(f"The storage {url.render_as_string()} cannot be used: {reason}") from None
+        time.sleep(PAUSE * attempt)
+        attempt += 1
+
+
+def main(argv: Sequence[str]) -> None:
+    """
+    :param argv: arguments of rl_zoo3's train
+    """
+    if {"-h", "--help"} & set(argv):
+        print(HELP)
+    parser = argparse.ArgumentParser(prog="sb3-htr optimize", add_help=False, allow_abbrev=False)
+    parser.add_argument("--env")
+    parser.add_argument("--storage")
+    parser.add_argument("--study-name")
+    args, _ = parser.parse_known_args(argv)
+    if args.storage and not args.study_name:
+        raise ValueError(
+            "--storage needs a --study-name, by which other workers and `sb3-htr train --trial-id` find the study."
+        )
+    study = create_study(args.storage, args.study_name) if args.storage else None
+    # Later arguments win, so this is a default
+    train.main(["-optimize", "--n-evaluations", "5", *argv])
+    if study is not None:
+        where = f"--study-name {args.study_name} --storage {args.storage}"
+        print(f"Train with the best trial so far: sb3-htr train --env {args.env} {where} --trial-id {study.best_trial.number}")

@@ -1,0 +1,61 @@
+"""Hyperparameters that ``sb3-htr optimize`` searches through."""
+
+from typing import TYPE_CHECKING, Any
+
+from sb3_htr.htr.hindsight_task import KEY_TO_HINDSIGHT_TASK_STRATEGY
+
+if TYPE_CHECKING:
+    import optuna
+
+# As in rl_zoo3, layers are sampled by name
+NET_ARCHS = {"small": [64, 64], "medium": [128, 128], "paper": [300, 300, 300]}
+# HTR paper, A.2
+RELABEL_PROBABILITIES = (0.1, 0.3, 0.5, 0.8, 1.0)
+ENCODER_ARCHS = {"small": [64, 64], "medium": [128, 128], "paper": [200, 200, 200]}
+
+
+def sample_pearl_params(trial: "optuna.Trial", n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param trial: draws the values
+    :param n_actions: not used
+    :param n_envs: not used
+    :param additional_args: rl_zoo3's; has the settings of the replay buffer that are not searched through
+    :return: arguments of PEARL
+    """
+    params: dict[str, Any] = {
+        "learning_rate": trial.suggest_float("learning_rate", 1e-4, 3e-3, log=True),
+        # Episodes have some tens to hundreds of steps
+        "one_minus_gamma": trial.suggest_float("one_minus_gamma", 0.005, 0.2, log=True),
+        "tau": trial.suggest_float("tau", 0.002, 0.05, log=True),
+        "ent_coef": trial.suggest_float("ent_coef", 1e-3, 1e-1, log=True),
+        "kl_coef": trial.suggest_float("kl_coef", 1e-4, 1e-1, log=True),
+        "batch_size_pow": trial.suggest_int("batch_size_pow", 3, 8),
+        "meta_batch_size_pow": trial.suggest_int("meta_batch_size_pow", 3, 6),
+        "gradient_steps_pow": trial.suggest_int("gradient_steps_pow", 6, 9),
+        "latent_dim": trial.suggest_int("latent_dim", 2, 8),
+        "net_arch": trial.suggest_categorical("net_arch", list(NET_ARCHS)),
+        "encoder_arch": trial.suggest_categorical("encoder_arch", list(ENCODER_ARCHS)),
+        "relabel_probability": trial.suggest_categorical("relabel_probability", RELABEL_PROBABILITIES),
+        "hindsight_task_strategy": trial.suggest_categorical("hindsight_task_strategy", list(KEY_TO_HINDSIGHT_TASK_STRATEGY)),
+    }
+    converted = convert_pearl_params(params)
+    buffer = {**additional_args.get("her_kwargs", {}), **converted["replay_buffer_kwargs"]}
+    return {**converted, "replay_buffer_kwargs": buffer}
+
+
+def convert_pearl_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param sampled_params: of a trial
+    :return: arguments of PEARL
+    """
+    params = dict(sampled_params)
+    converted: dict[str, Any] = {"gamma": 1 - params.pop("one_minus_gamma")}
+    for name in ("batch_size", "meta_batch_size", "gradient_steps"):
+        converted[name] = 2 ** params.pop(f"{name}_pow")
+    converted["policy_kwargs"] = {
+        "latent_dim": params.pop("latent_dim"),
+        "net_arch": NET_ARCHS[params.pop("net_arch")],
+        "encoder_arch": ENCODER_ARCHS[params.pop("encoder_arch")],
+    }
+    converted["replay_buffer_kwargs"] = {name: params.pop(name) for name in ("relabel_probability", "hindsight_task_strategy")}
+    return {**converted, **params}

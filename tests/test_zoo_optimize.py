@@ -1,0 +1,186 @@
+"""``sb3-htr optimize``: what is searched for, and where the study is kept."""
+
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import optuna
+import pytest
+import yaml
+from conftest import ENV_ID, TINY
+
+from sb3_htr import PEARL
+from sb3_htr.pearl.divergence import DivergedError
+from sb3_htr.zoo import optimize, search_space, train
+from sb3_htr.zoo.cli import main
+from sb3_htr.zoo.search_space import convert_pearl_params, sample_pearl_params
+
+SMALL = ["-params", "n_tasks_per_rollout:4", "n_episodes_per_task:3", "learning_starts:240", "n_envs:4"]
+
+
+def sample_little(trial: optuna.Trial, *_: Any) -> dict[str, Any]:
+    """Makes trials that take a moment."""
+    rate = trial.suggest_float("learning_rate", 1e-4, 1e-3)
+    return {"learning_rate": rate, "gradient_steps": 2, "policy_kwargs": TINY["policy_kwargs"]}
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(train, "sample_pearl_params", sample_little)
+    monkeypatch.setattr(train, "convert_pearl_params", lambda params: params)
+    monkeypatch.setattr(optimize, "PAUSE", 0.05)
+
+
+def search(folder: Path, storage: str, n_trials: int = 2) -> int:
+    arguments = ["optimize", "--env", ENV_ID, "-f", str(folder), "-n", "480", "--n-trials", str(n_trials), "--seed", "1"]
+    return main([*arguments, "--n-evaluations", "2", "--storage", storage, "--study-name", "test", "--verbose", "0", *SMALL])
+
+
+def check_search(folder: Path, storage: str, capsys: pytest.CaptureFixture[str]) -> optuna.Study:
+    """Two trials, then a third by another worker, then a training with what trial 0 had."""
+    assert search(folder, storage) == 0
+    assert search(folder, storage, n_trials=1) == 0
+    study = optimize.create_study(storage, "test")
+    assert [trial.number for trial in study.get_trials()] == [0, 1, 2]
+    output = capsys.readouterr().out
+    assert f"--study-name test --storage {storage} --trial-id {study.best_trial.number}" in output
+    assert len(list(folder.glob("pearl/report_*.csv"))) >= 1 and not list(folder.glob(f"pearl/{ENV_ID}_*"))
+    arguments = ["train", "--env", ENV_ID, "-f", str(folder), "-n", "240", "--eval-freq", "-1", "--verbose", "0"]
+    assert main([*arguments, "--storage", storage, "--study-name", "test", "--trial-id", "0", *SMALL]) == 0
+    model = PEARL.load(folder / "pearl" / f"{ENV_ID}_1" / f"{ENV_ID}.zip")
+    assert model.learning_rate(1.0) == study.trials[0].params["learning_rate"]  # type: ignore[operator]
+    return study
+
+
+def test_a_study_in_sqlite(quick: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    study = check_search(tmp_path, f"sqlite:///{tmp_path}/study.db", capsys)
+    # Two evaluations of each trial, the last of them is its value
+    for trial in study.get_trials(states=[optuna.trial.TrialState.COMPLETE]):
+        assert list(trial.intermediate_values) == [1, 2] and trial.intermediate_values[2] == trial.value
+
+
+def test_a_study_in_a_journal(quick: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    check_search(tmp_path, f"{tmp_path}/journal/study.log", capsys)
+
+
+def as_postgres(command: list[str]) -> list[str]:
+    # PostgreSQL refuses to be run by root
+    return ["runuser", "-u", "postgres", "--", *command] if os.geteuid() == 0 else command
+
+
+@pytest.fixture(scope="module")
+def postgresql() -> Iterator[str]:
+    """URL of an empty database on a server that listens on a socket in a folder of its own."""
+    pytest.importorskip("psycopg", reason="psycopg is not installed: pip install 'sb3_htr[postgresql]'")
+    folders = [None, *sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True)]
+    found = [(shutil.which("initdb", path=folder), shutil.which("pg_ctl", path=folder)) for folder in folders]
+    initdb, pg_ctl = next((pair for pair in found if all(pair)), (None, None))
+    if initdb is None or pg_ctl is None:
+        pytest.skip("no PostgreSQL server here: apt-get install postgresql")
+    if os.geteuid() == 0 and (shutil.which("runuser") is None or subprocess.run(["id", "-u", "postgres"]).returncode):
+        pytest.skip("PostgreSQL does not run as root, and there is no user postgres to run it as")
+    # Short: the path of a socket has at most 107 characters
+    folder = Path(tempfile.mkdtemp(prefix="pg"))
+    if os.geteuid() == 0:
+        shutil.chown(folder, "postgres")
+    data, options = str(folder / "data"), f"-k {folder} -c listen_addresses= -c fsync=off"
+
+    def control(*arguments: str) -> None:
+        subprocess.run(as_postgres([pg_ctl, "-D", data, "-w", *arguments]), check=True, cwd=folder, stdout=subprocess.DEVNULL)
+
+    try:
+        subprocess.run(
+            as_postgres([initdb, "-D", data, "-A", "trust", "-U", "htr", "-N"]),
+            check=True,
+            cwd=folder,
+            stdout=subprocess.DEVNULL,
+        )
+        control("start", "-o", options, "-l", str(folder / "log"))
+        try:
+            yield f"postgresql+psycopg://htr@/postgres?host={folder}"
+        finally:
+            control("stop", "-m", "immediate")
+    finally:
+        shutil.rmtree(folder)
+
+
+def test_workers_that_begin_at_once_share_a_study_in_postgresql(postgresql: str, quick: None) -> None:
+    with ThreadPoolExecutor(4) as pool:
+        studies = list(pool.map(lambda _: optimize.create_study(postgresql, "race"), range(4)))
+    assert len({study._study_id for study in studies}) == 1
+
+
+def test_a_study_in_postgresql(postgresql: str, quick: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    check_search(tmp_path, postgresql, capsys)
+
+
+def test_bad_storages_are_named_in_one_sentence(quick: None, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="--storage needs a --study-name"):
+        main(["optimize", "--env", ENV_ID, "--storage", "sqlite:///x.db"])
+    with pytest.raises(ValueError, match=r"--storage is 'study.db', expected sqlite:///FILE"):
+        search(tmp_path, "study.db")
+    with pytest.raises(ValueError, match=r"The storage sqlite:////nowhere/study.db cannot be used: unable to open"):
+        search(tmp_path, "sqlite:////nowhere/study.db")
+
+
+def test_what_is_sampled_makes_a_model_and_is_what_is_loaded() -> None:
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    for _ in range(10):
+        trial = study.ask()
+        sampled = sample_pearl_params(trial, 2, 1, {"her_kwargs": {"rl_batch_source": "task", "relabel_probability": 0.2}})
+        converted = convert_pearl_params(trial.params)
+        assert sampled["replay_buffer_kwargs"].pop("rl_batch_source") == "task"
+        assert sampled == converted and 0.8 <= converted["gamma"] < 1
+        model = PEARL("MlpPolicy", ENV_ID, **sampled)
+        assert model.policy.latent_dim == trial.params["latent_dim"]
+        assert model.policy.encoder_arch == search_space.ENCODER_ARCHS[trial.params["encoder_arch"]]
+
+
+def test_a_trial_joins_the_settings_of_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """rl_zoo3 replaces the dicts of the file, and takes trial 0 for none."""
+    storage = f"sqlite:///{tmp_path}/study.db"
+    study = optimize.create_study(storage, "test")
+    study.enqueue_trial({"learning_rate": 0.002, "relabel_probability": 0.3})
+    asked = study.ask()
+    sample_pearl_params(asked, 2, 1, {})
+    study.tell(asked, 1.0)
+    settings = {key: value for key, value in TINY.items() if key != "seed"}
+    block = {**settings, "policy": "MlpPolicy", "n_timesteps": 240, "n_envs": 4}
+    block["replay_buffer_kwargs"] = {"rl_batch_source": "task", "relabel_probability": 0.9}
+    (tmp_path / "my.yml").write_text(yaml.safe_dump({ENV_ID: block}))
+    arguments = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(tmp_path / "my.yml"), "--eval-freq", "-1"]
+    trial = ["--storage", storage, "--study-name", "test", "--trial-id", "0", "-params", "gradient_steps:2"]
+    assert main([*arguments, "--verbose", "0", *trial]) == 0
+    model = PEARL.load(tmp_path / "pearl" / f"{ENV_ID}_1" / f"{ENV_ID}.zip")
+    strategy = asked.params["hindsight_task_strategy"]
+    expected = {"rl_batch_source": "task", "relabel_probability": 0.3, "hindsight_task_strategy": strategy}
+    assert model.replay_buffer_kwargs == expected
+    assert model.gradient_steps == 2, "-params wins over the trial"
+
+
+def test_hyperparameters_that_diverge_are_pruned(quick: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def diverge(*_: Any, **__: Any) -> None:
+        raise DivergedError("critic_loss is nan")
+
+    monkeypatch.setattr(PEARL, "learn", diverge)
+    with pytest.raises(ValueError, match="No trials are completed"):
+        search(tmp_path, f"{tmp_path}/study.log", n_trials=1)
+    study = optimize.create_study(f"{tmp_path}/study.log", "test")
+    assert [trial.state for trial in study.get_trials()] == [optuna.trial.TrialState.PRUNED]
+
+
+def test_the_objective_is_the_return_after_adaptation(quick: None, tmp_path: Path) -> None:
+    log = tmp_path / "trials"
+    arguments = ["optimize", "--env", ENV_ID, "-f", str(tmp_path), "-n", "480", "--n-trials", "1", "--n-evaluations", "1"]
+    storage = ["--storage", f"{tmp_path}/s.log", "--study-name", "test", "--optimization-log-path", str(log)]
+    # Every goal disc of this distance holds the start, so that there are rewards
+    assert main([*arguments, *storage, "--verbose", "0", "--env-kwargs", "goal_distance:0.05", *SMALL]) == 0
+    evaluations = np.load(log / "trial_0" / "evaluations.npz")
+    value = optimize.create_study(f"{tmp_path}/s.log", "test").best_value
+    assert value == pytest.approx(evaluations["returns"][-1, :, -1].mean()) and value > 0
