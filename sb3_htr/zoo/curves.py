@@ -75,5 +75,6 @@ def plot_curves(curves: dict[str, Curve], path: Path, title: str, x_label: str, 
     for axes, y_label in zip((left, right), y_labels, strict=True):
         axes.set_xlabel(x_label)
         axes.set_ylabel(y_label)
+        axes.xaxis.get_major_locator().set_params(integer=True)
     interval = any(len(curve.returns) > 1 for curve in curves.values())
     finish(figure, path, f"{title}{': IQM over seeds, 95 % interval' if interval else ''}")

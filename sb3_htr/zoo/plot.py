@@ -51,6 +51,7 @@ def adapt(agent: TrainedAgent, args: argparse.Namespace) -> Adapted:
     :param args: which set, and how
     :return: what happened
     """
+    print(f"Adapting {agent.path}")
     model = agent.load(args.device)
     family = get_task_family(agent.make_vec_env(1))
     tasks: np.ndarray = getattr(family, f"{args.tasks}_tasks")

@@ -1,0 +1,155 @@
+"""The page that goes with a shared agent."""
+
+import shlex
+from typing import Any
+
+import yaml
+from huggingface_hub import EvalResult, ModelCardData
+
+from sb3_htr.common.evaluation import AdaptationRecord
+
+TAGS = (
+    "deep-reinforcement-learning",
+    "reinforcement-learning",
+    "stable-baselines3",
+    "meta-reinforcement-learning",
+    "hindsight-task-relabelling",
+    "sb3_htr",
+)
+# Adaptation episodes in the table, and the last one
+SHOWN = (1, 2, 3, 5, 10)
+# Arguments of a training that change nothing of its result, with the number of their values
+LOCAL = {"-f": 1, "--log-folder": 1, "-tb": 1, "--tensorboard-log": 1, "-P": 0, "--progress": 0, "--verbose": 1, "--seed": 1}
+
+
+def method(hyperparams: dict[str, Any]) -> str:
+    """
+    :param hyperparams: of a run
+    :return: name of the method, as in ``results/``
+    """
+    buffer = hyperparams.get("replay_buffer_kwargs") or {}
+    if "EpisodeClustering" in str(hyperparams.get("replay_buffer_class")):
+        return "htr-ec"
+    if buffer.get("relabel_probability", 0.8) > 0:
+        return "htr-ser"
+    return "pearl-dense" if buffer.get("rl_reward_type") == "dense" else "pearl-sparse"
+
+
+def training_command(record: dict[str, Any]) -> str:
+    """
+    :param record: of a run
+    :return: the command that trains the same agent on another machine
+    """
+    if "arguments" not in record:
+        return str(record.get("command", "unknown"))
+    arguments = list(record["arguments"])
+    # What `sb3-htr train` puts in front: --algo, -conf, --num-threads, --save-freq
+    if arguments[:2] == ["--algo", "pearl"] and arguments[2:3] == ["-conf"]:
+        arguments = arguments[8:]
+    words: list[str] = []
+    while arguments:
+        word = arguments.pop(0)
+        if word in LOCAL:
+            del arguments[: LOCAL[word]]
+        else:
+            words.append(word)
+    return shlex.join(["sb3-htr", "train", *words, "--seed", str(record["seed"])])
+
+
+def table(scores: dict[str, AdaptationRecord]) -> str:
+    """
+    :param scores: explorer and adaptations
+    :return: Markdown
+    """
+    n_episodes = next(iter(scores.values())).returns.shape[1]
+    head = ["adaptation episode", *(f"{what}, explorer `{name}`" for name in scores for what in ("return", "tasks solved"))]
+    lines = [head, ["---"] * len(head)]
+    for i in sorted({episode for episode in SHOWN if episode < n_episodes} | {n_episodes}):
+        cells = [str(i)]
+        for record in scores.values():
+            returns = record.returns[:, i - 1]
+            cells += [f"{returns.mean():.2f} ± {returns.std():.2f}", f"{record.successes[:, i - 1].mean():.0%}"]
+        lines.append(cells)
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def model_card(record: dict[str, Any], scores: dict[str, AdaptationRecord], repo_id: str | None = None) -> str:
+    """
+    :param record: of an exported agent
+    :param scores: explorer and its adaptations to the test tasks
+    :param repo_id: where it will be on the Hugging Face Hub
+    :return: content of ``README.md``
+    """
+    env_id, name = record["env_id"], method(record.get("hyperparams", {}))
+    explorer, adapted = next(iter(scores.items()))
+    n_tasks, n_episodes = adapted.returns.shape
+    returns = adapted.returns[:, -1]
+    result = EvalResult(
+        task_type="reinforcement-learning",
+        task_name="meta-reinforcement-learning",
+        dataset_type=env_id,
+        dataset_name=f"{env_id}, {n_tasks} test tasks",
+        metric_type="mean_reward",
+        metric_name=f"return of adaptation episode {n_episodes}, explorer {explorer}",
+        metric_value=f"{returns.mean():.2f} +/- {returns.std():.2f}",
+        verified=False,
+    )
+    data = ModelCardData(library_name="stable-baselines3", tags=[env_id, *TAGS], model_name=name, eval_results=[result])
+    kwargs = "".join(f", {key}={value!r}" for key, value in record["env_kwargs"].items())
+    imports = "".join(f"import {package}  # registers the env\n" for package in record["gym_packages"] or ["htr_envs"])
+    path = f'"{env_id}.zip"'
+    if repo_id is not None:
+        imports += "from huggingface_hub import hf_hub_download\n"
+        path = f'hf_hub_download("{repo_id}", {path})'
+    about = " with Hindsight Task Relabelling (Packer, Abbeel and Gonzalez, 2021)" if name.startswith("htr") else ""
+    versions = ", ".join(f"{package} {version}" for package, version in record.get("versions", {}).items())
+    return f"""---
+{data.to_yaml()}
+---
+
+# {name} on {env_id}
+
+An agent that adapts: PEARL (Rakelly et al., 2019){about}, trained with `sb3_htr` on
+Stable-Baselines3. It is not told its task: it tries a few episodes, infers the task from sparse rewards, and then solves it.
+
+## Scores
+
+Undiscounted return (mean ± standard deviation over tasks) and share of tasks solved, on {n_tasks} test tasks that training
+has not seen, with mean actions. The explorer says how z is chosen before the first reward; `prior` is the protocol of PEARL's
+paper.
+
+{table(scores)}
+
+## Use
+
+```console
+$ pip install 'sb3_htr[zoo,video]'
+$ sb3-htr enjoy {env_id}.zip
+```
+
+```python
+import gymnasium
+
+{imports}from sb3_htr import PEARL
+
+model = PEARL.load({path})
+env = gymnasium.make("{env_id}"{kwargs})
+agent = model.adapt(env, n_episodes={min(n_episodes, 10)}, task=env.unwrapped.test_tasks[0])
+print(agent.returns)  # of the adaptation episodes; agent.predict(observation) acts on this task
+```
+
+`predict` of the model itself acts without knowing any task. A model file can run code when it is loaded;
+`sb3_htr.load_untrusted(path, env)` reads the weights and plain settings alone.
+
+## Training
+
+```console
+$ {record.get("command", "unknown")}
+```
+
+The model after {record["num_timesteps"]:,} env steps ({record["model"]}). {versions}.
+
+```yaml
+{yaml.safe_dump(record.get("hyperparams", {}), sort_keys=True).strip()}
+```
+"""
