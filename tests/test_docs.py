@@ -1,10 +1,15 @@
-"""The Python of the manual and of the README runs."""
+"""The Python of the manual and of the README runs, and so do the commands."""
 
 import importlib
 import re
+import shlex
 from pathlib import Path
 
 import pytest
+from test_zoo import SMALL
+from test_zoo_optimize import quick  # noqa: F401 fixture
+
+from sb3_htr.zoo.cli import main
 
 ROOT = Path(__file__).parents[1]
 
@@ -30,3 +35,33 @@ def test_the_code_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_a_new_family_takes_less_than_60_lines() -> None:
     assert len(python_blocks(ROOT / "docs" / "own_task_family.md").splitlines()) < 60
+
+
+# Later arguments win, so these make each command of the manual a short one
+SHORT = {
+    "train": ["-n", "480", "--eval-freq", "480", "--verbose", "0", "-params", *SMALL],
+    "optimize": ["-n", "480", "--verbose", "0", "-params", *(setting for setting in SMALL if "policy_kwargs" not in setting)],
+    "evaluate": ["--n-episodes", "2"],
+    "enjoy": ["--n-episodes", "2"],
+    "record": ["--n-episodes", "1"],
+    "plot": ["--n-episodes", "2"],
+    "export": ["--n-episodes", "2"],
+}
+
+
+def test_the_commands_run(
+    quick: None,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """A day of a user: the commands of the page, one after the other in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    text = (ROOT / "docs" / "cli.md").read_text()
+    commands = [shlex.split(line)[1:] for line in re.findall(r"^\$ (sb3-htr .*)", text, flags=re.MULTILINE)]
+    assert {command for command, *_ in commands} == SHORT.keys()
+    for command, *arguments in commands:
+        assert main([command, *arguments, *SHORT[command]]) == 0, arguments
+    written = ("runs/pearl/SparsePointRobot-v0_1/adaptation_curve.png", "adaptation.gif", "pictures/learning_curves.png")
+    for name in (*written, "plots/adaptation_paths.png", "study.db", "my_agent/README.md"):
+        assert (tmp_path / name).stat().st_size > 1000, name

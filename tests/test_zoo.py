@@ -1,9 +1,12 @@
 """The commands, as a user would call them."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -114,9 +117,57 @@ def test_episode_clustering_can_be_asked_for_by_name(tmp_path: Path) -> None:
     assert model.replay_buffer_class is EpisodeClustering
 
 
+def test_weights_and_biases_gets_what_tensorboard_gets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: dict[str, Any] = {}
+    config: dict[str, Any] = {}
+
+    class Run:
+        class config:
+            setdefaults = config.update
+
+    def init(**kwargs: Any) -> type[Run]:
+        begun.update(kwargs)
+        return Run
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "wandb", cast(ModuleType, SimpleNamespace(init=init)))
+    arguments = [
+        "train",
+        "--env",
+        ENV_ID,
+        "-f",
+        "logs",
+        "-n",
+        "240",
+        "--eval-freq",
+        "240",
+        "--verbose",
+        "0",
+        "-params",
+        *SMALL,
+    ]
+    track = ["--track", "--wandb-project-name", "meta", "--seed", "3"]
+    assert main([*arguments, *track]) == 0
+    assert begun["project"] == "meta" and begun["sync_tensorboard"] and begun["name"].startswith(f"{ENV_ID}__pearl__3")
+    assert config["saved_hyperparams"]["n_tasks_per_rollout"] == 4
+    assert list((tmp_path / "runs" / begun["name"]).glob("**/events*"))
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    with pytest.raises(ImportError, match="pip install wandb"):
+        main([*arguments, *track])
+
+
+def test_every_hyperparameter_names_its_source() -> None:
+    for file in sorted(hyperparams_file().parent.glob("*.yml")):
+        for number, line in enumerate(file.read_text().splitlines(), start=1):
+            if re.match(r"\s+\w+: *[^&* ]", line) and not line.strip().startswith(("#", "policy:")):
+                assert "# " in line, f"{file.name}, line {number}: {line.strip()} has no source"
+
+
 def test_help_and_mistakes(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main(["--help"]) == 0 and "evaluate" in capsys.readouterr().out
     assert main(["trian"]) == 2 and "usage: sb3-htr" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="--algo is 'sac', but sb3-htr trains pearl"):
+        main(["train", "--env", ENV_ID, "--algo", "sac"])
     with pytest.raises(FileNotFoundError, match="There is no run in"):
         main(["evaluate", str(tmp_path)])
 

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import os
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -136,7 +137,7 @@ def find_model(run: Path, env_id: str, which: str) -> Path:
     )
 
 
-def agent_at(path: Path, which: str = "best", env_id: str | None = None) -> TrainedAgent:
+def agent_at(path: str | os.PathLike[str], which: str = "best", env_id: str | None = None) -> TrainedAgent:
     """
     :param path: a run folder, a folder of runs, of which the newest is meant, an exported folder, or a model file
     :param which: ``"best"`` or ``"last"`` model of a run
@@ -145,6 +146,7 @@ def agent_at(path: Path, which: str = "best", env_id: str | None = None) -> Trai
     :raises FileNotFoundError: if there is none
     :raises ValueError: if it is no model file, or one that does not say its env
     """
+    path = Path(path)
     files = list(path.glob("*.zip"))
     if len(files) == 1 and not any(path.rglob(RECORD)):
         path = files[0]
@@ -167,7 +169,9 @@ def agent_at(path: Path, which: str = "best", env_id: str | None = None) -> Trai
     return TrainedAgent(path, {"env_id": env_id, "env_kwargs": {}, "gym_packages": []}, None)
 
 
-def agent_for(env_id: str, folder: Path, method: str | None = None, exp_id: int = 0, which: str = "best") -> TrainedAgent:
+def agent_for(
+    env_id: str, folder: str | os.PathLike[str] = "logs", method: str | None = None, exp_id: int = 0, which: str = "best"
+) -> TrainedAgent:
     """
     :param env_id: env
     :param folder: log folder of ``sb3-htr train``, with the runs in ``<method>/<env_id>_<exp_id>``
@@ -179,7 +183,7 @@ def agent_for(env_id: str, folder: Path, method: str | None = None, exp_id: int 
     """
     methods = METHODS if method is None else (method,)
     for name in methods:
-        runs = [path.parent for path in (folder / name).glob(f"{env_id}_*/{RECORD}") if _number(path.parent, env_id) > 0]
+        runs = [path.parent for path in Path(folder, name).glob(f"{env_id}_*/{RECORD}") if _number(path.parent, env_id) > 0]
         runs = sorted(runs, key=lambda run: _number(run, env_id), reverse=True)
         for run in [run for run in runs if exp_id in (0, _number(run, env_id))]:
             # A run that has no model yet is passed over, if it was not asked for

@@ -261,7 +261,10 @@ def _arguments(argv: Sequence[str]) -> tuple[list[str], Path | None]:
     """Those for rl_zoo3, and the run to go on with."""
     parser = argparse.ArgumentParser(prog="sb3-htr train", add_help=False, allow_abbrev=False)
     parser.add_argument("--resume", type=Path)
+    parser.add_argument("--algo", default="pearl")
     args, rest = parser.parse_known_args(argv)
+    if args.algo != "pearl":
+        raise ValueError(f"--algo is {args.algo!r}, but sb3-htr trains pearl: `python -m rl_zoo3.train` has SB3's algorithms.")
     if args.resume is None:
         # Later arguments win, so these are defaults. One thread: two runs on two cores must not fight for them.
         defaults = ["--algo", "pearl", "-conf", str(hyperparams_file()), "--num-threads", "1", "--save-freq", "20000"]
