@@ -334,3 +334,13 @@ def test_the_frozen_agent_acts_with_what_is_known_to_work(tiny_pearl: MakePEARL)
     z = play(adaptation, [[0.0, 0.0], [5.0, 0.0], [1.0, 0.0]])
     np.testing.assert_array_equal(adaptation.frozen_z()[0], z[1][0])
     np.testing.assert_array_equal(adaptation.frozen_z()[1], adaptation.z[1])  # nothing is known to work
+
+
+def test_what_is_known_about_z_before_a_reward(tiny_pearl: Callable[..., PEARL]) -> None:
+    model = tiny_pearl()
+    # The aggregate of a new model is N(0, I), drawn from with 1.5 times its deviation
+    for explorer, expected in (("prior", 1.0), ("aggregate", 1.5), ("search", 1.5)):
+        adaptation = model.start_adaptation(4, explorer=explorer)
+        np.testing.assert_allclose(adaptation.deviation(), np.full((4, 3), expected), rtol=1e-6)
+        mean, deviation = adaptation.posterior()
+        assert (mean == 0).all() and (deviation == 1).all() and mean.shape == (4, 3)

@@ -91,7 +91,7 @@ def test_agents_that_are_not_there_are_said_to_be_so(tmp_path: Path, tiny_pearl:
         ),
         (["--env", ENV_ID, "--exp-id", "7"], "no trained agent for SparsePointRobot-v0 run 7"),
         ([str(tmp_path / "text.zip")], "is no model file"),
-        ([str(tmp_path / "absent")], "There is no .*absent"),
+        ([str(tmp_path / "absent")], "absent does not exist: give a run folder"),
         ([str(tmp_path / "loose.zip")], "does not say which env it was trained on: add --env ID"),
         ([*NOWHERE, "--task", "21"], "There is no test task 21: --task takes numbers from 1 to 20"),
         ([*NOWHERE, "--n-episodes", "0"], "--n-episodes is 0, expected at least 1"),

@@ -155,7 +155,7 @@ def agent_at(path: str | os.PathLike[str], which: str = "best", env_id: str | No
         record = json.loads((run / RECORD).read_text())
         return TrainedAgent(find_model(run, record["env_id"], which), record, run)
     if not path.exists():
-        raise FileNotFoundError(f"There is no {path}: give a run folder, a folder of runs, or a model file (.zip).")
+        raise FileNotFoundError(f"{path} does not exist: give a run folder, a folder of runs, or a model file (.zip).")
     try:
         with zipfile.ZipFile(path) as archive:
             if RECORD in archive.namelist():
