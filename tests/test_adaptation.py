@@ -312,19 +312,21 @@ def test_known_tasks_are_those_that_were_ever_reached(tiny_pearl: MakePEARL) -> 
     model.learn(4 * ROLLOUT)
     bank, buffer = model.task_bank, model.replay_buffer
     assert isinstance(bank, TaskBank) and buffer is not None and len(bank.solved) > 20
-    context, mask, returns, first_success = bank.best_episodes(buffer, 128)
+    rows, lengths, returns, first_success = bank.best_episodes(buffer, 128)
+    assert (lengths == 20).all()
+    context = rows.reshape(len(lengths), 20, -1)
     tasks = bank.task_family.train_tasks[bank.solved]
     position = context[..., :2] + 0.1 * np.clip(context[..., 2:4], -1, 1)
     distance = np.linalg.norm(position[:, None] - tasks[:, None], axis=-1)
-    reward = np.where(distance < 0.2, 1 - distance, 0) * mask[:, None]
+    reward = np.where(distance < 0.2, 1 - distance, 0)
     np.testing.assert_allclose(returns, reward.sum(axis=-1), atol=0.9)  # a step on the rim may count or not
     assert (np.diag(returns) > 0).all() and (np.diag(first_success) < 20).all()
     np.testing.assert_array_equal(np.isfinite(first_success), returns > 0)
-    np.testing.assert_allclose(context[..., -1] * mask, np.einsum("iit->it", reward), atol=0.9)
+    np.testing.assert_allclose(context[..., -1], np.einsum("iit->it", reward), atol=0.9)
     known = model.policy.latent_prior.known_tasks()
     np.testing.assert_array_equal(known.returns, returns)
     fewer = bank.best_episodes(buffer, 7)
-    assert [len(array) for array in fewer] == [7] * 4
+    assert [len(array) for array in fewer] == [7 * 20, 7, 7, 7]
 
 
 def test_the_frozen_agent_acts_with_what_is_known_to_work(tiny_pearl: MakePEARL) -> None:

@@ -78,7 +78,7 @@ def test_critic_gradients_do_not_leak_into_the_encoder_from_the_actor(tiny_pearl
     model._update_learning_rate = lambda optimizers: None  # type: ignore[method-assign]
     model.encoder.optimizer.param_groups[0]["lr"] = 1e-2
     data = model.replay_buffer.sample(4)  # type: ignore[union-attr]
-    z = model.encoder(data.context, data.context_mask)[0].detach()
+    z = model.encoder(data.context, data.context_lengths)[0].detach()
     assert not z.requires_grad
     model.train(1)
     after = parameters(model)

@@ -48,14 +48,17 @@ class Adaptation:
         # Return of the best episode, without the task-free part
         self.best_return = np.zeros(n_envs, dtype=np.float64)
         self.z = np.zeros((n_envs, policy.latent_dim), dtype=np.float32)
+        # Of the running episodes
         self._rows = np.zeros((n_envs, 64, policy.context_dim), dtype=np.float32)
         self._n_rows = np.zeros(n_envs, dtype=np.int64)
-        self._episode_start = np.zeros(n_envs, dtype=np.int64)
         self._episode_return = np.zeros(n_envs, dtype=np.float64)
         # Whether z has changed within the episode
         self._turned = np.zeros(n_envs, dtype=bool)
-        # Rows of the best episode, first and last + 1
-        self._best = np.zeros((n_envs, 2), dtype=np.int64)
+        # The posterior, as precision and precision times mean, which products of Gaussians add up. Meta-training sees contexts
+        # of one rewarded episode; the misses of a search would look like nothing it knows. So it is over the best episode,
+        # or, for the explorer PRIOR, over all of them
+        self._precision = np.zeros_like(self.z)
+        self._precision_mean = np.zeros_like(self.z)
         self._best_z = np.zeros_like(self.z)
         # Episodes since the best one
         self._setbacks = np.zeros(n_envs, dtype=np.int64)
@@ -91,13 +94,13 @@ class Adaptation:
         returns = np.where(self._turned, np.minimum(self._episode_return, FOUND), self._episode_return)
         better = ended[returns[ended] > self.best_return[ended] + 0.5 * ROUNDING]
         self.best_return[better] = returns[better]
-        self._best[better] = np.stack([self._episode_start, self._n_rows], axis=1)[better]
         self._best_z[better] = self.z[better]
         self._setbacks[ended] += 1
         self._setbacks[better] = 0
         self._episode_return[ended] = 0
         self._turned[ended] = False
-        self._episode_start[ended] = self._n_rows[ended]
+        self._infer(ended if self.explorer is Explorer.PRIOR else better)
+        self._n_rows[ended] = 0
         self.n_episodes[ended] += 1
         self._draw(ended)
 
@@ -130,18 +133,25 @@ class Adaptation:
             visit = exploring | ((self._setbacks[envs] % 2 == 0) & ~settled)
             self.z[envs[visit]] = self._search.begin(envs[visit], exploring[visit])
 
-    def _sample_posterior(self, envs: np.ndarray) -> np.ndarray:
-        row = np.arange(self._n_rows[envs].max())
-        if self.explorer is Explorer.PRIOR:
-            mask = row < self._n_rows[envs, None]
-        else:
-            # Meta-training sees contexts of one rewarded episode; the misses of a search would look like nothing it knows
-            mask = (row >= self._best[envs, :1]) & (row < self._best[envs, 1:])
+    def _infer(self, envs: np.ndarray) -> None:
+        """Take the episodes that end into the posterior."""
+        if len(envs) == 0:
+            return
+        lengths = self._n_rows[envs]
+        rows = self._rows[envs][np.arange(self._rows.shape[1]) < lengths[:, None]]
         device = self.policy.device
         with th.no_grad():
-            context = th.as_tensor(self._rows[envs, : len(row)], device=device)
-            mean, variance = self.policy.encoder(context, th.as_tensor(mask, dtype=th.float32, device=device))
-        deviation = variance.sqrt().cpu().numpy()
+            mean, variance = self.policy.encoder(th.as_tensor(rows, device=device), th.as_tensor(lengths, device=device))
+        if self.explorer is not Explorer.PRIOR:
+            self._precision[envs] = self._precision_mean[envs] = 0
+        self._precision[envs] += (1 / variance).cpu().numpy()
+        self._precision_mean[envs] += (mean / variance).cpu().numpy()
+
+    def _sample_posterior(self, envs: np.ndarray) -> np.ndarray:
+        # N(0, 1) where there is no evidence yet
+        variance = 1 / np.where(self._precision[envs] > 0, self._precision[envs], 1)
+        deviation = np.sqrt(variance)
         if self.explorer is not Explorer.PRIOR:
             deviation *= 1 + self._setbacks[envs, None]
-        return mean.cpu().numpy() + deviation * th.randn(mean.shape, generator=self.generator).numpy()
+        noise = th.randn(deviation.shape, generator=self.generator).numpy()
+        return np.asarray(variance * self._precision_mean[envs] + deviation * noise)

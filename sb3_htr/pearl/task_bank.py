@@ -75,9 +75,9 @@ class TaskBank:
 
         :param buffer: names the columns of the episodes
         :param size: largest number of tasks; of more, evenly spread ones are taken
-        :return: contexts (n, T, obs_dim + action_dim + 1), rows (o, a, r); their mask (n, T); and of episode i under task j
-            the return without the task-free part (n, n) and the number of steps before the first success (n, n), infinite
-            without one
+        :return: contexts (n_rows, obs_dim + action_dim + 1), rows (o, a, r) of all episodes; how many are of each (n,); and of
+            episode i under task j the return without the task-free part (n, n) and the number of steps before the first
+            success (n, n), infinite without one
         """
         solved = self.solved
         solved = solved[np.linspace(0, len(solved) - 1, min(size, len(solved))).round().astype(np.int64)]
@@ -85,9 +85,10 @@ class TaskBank:
         valid = np.arange(episodes.shape[1]) < self.length[solved, None]
         context = episodes[..., : buffer.context_dim].copy()
         context[..., -1] = self.task_family.compute_reward(buffer.trajectory(episodes), tasks)
+        context = context[valid]
         success, returns = self._outcome(buffer, episodes, valid, tasks)
         first_success = np.where(success.any(axis=-1), success.argmax(axis=-1), np.inf)
-        return context, valid.astype(np.float32), returns, first_success.astype(np.float32)
+        return context, self.length[solved], returns, first_success.astype(np.float32)
 
     def _outcome(
         self, buffer: MultiTaskReplayBuffer, episodes: np.ndarray, valid: np.ndarray, tasks: np.ndarray
