@@ -87,6 +87,15 @@ def test_critic_gradients_do_not_leak_into_the_encoder_from_the_actor(tiny_pearl
     assert all(p.grad is not None and p.requires_grad for p in model.critic.parameters())
 
 
+def test_the_precision_of_matrix_products_is_that_of_updates_only(tiny_pearl: MakePEARL, monkeypatch: Any) -> None:
+    model = tiny_pearl(matmul_precision="medium")
+    seen = []
+    update = model._update
+    monkeypatch.setattr(model, "_update", lambda size: (seen.append(th.get_float32_matmul_precision()), update(size))[1])
+    model.learn(ROLLOUT)
+    assert set(seen) == {"medium"} and th.get_float32_matmul_precision() == "highest"
+
+
 @pytest.mark.parametrize("n_envs", [1, 3, 5])
 def test_any_number_of_envs(tiny_pearl: MakePEARL, n_envs: int) -> None:
     """4 tasks on n envs take ceil(4 / n) rounds of 3 episodes each."""

@@ -14,6 +14,9 @@ from sb3_htr.common.type_aliases import MultiTaskSamples, TaskFamily, Trajectory
 from sb3_htr.htr.episode_store import EpisodeIndex, EpisodeStore
 from sb3_htr.htr.hindsight_task import HindsightTaskStrategy, choose_rare, select_step, to_hindsight_task_strategy
 
+# Rows that candidates for hindsight tasks are compared with: enough to tell common from rare, in linear time
+MAX_COMPARED = 64
+
 
 def spread(rng: np.random.Generator, ranges: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
     """
@@ -388,10 +391,10 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         return np.stack([source, rl_source]), hindsight_task[chosen]
 
     def _count_alike(self, reached: Trajectory, task: np.ndarray) -> np.ndarray:
-        """(n, n_candidates), how many rows solve each candidate's task with their first candidate, plus 1."""
+        """(n, n_candidates), how many of some other rows solve each candidate's task with their first candidate, plus 1."""
         if task.shape[1] == 1:
             return np.ones(task.shape[:2])
-        first = Trajectory(*(values[:, 0] for values in reached))
+        first = Trajectory(*(values[:MAX_COMPARED, 0] for values in reached))
         return 1 + self.task_family.is_success(first, task[:, :, None])[..., 0].sum(axis=-1)
 
     def _write_rewards(self, rows: np.ndarray, where: np.ndarray, tasks: np.ndarray, reward_type: str) -> None:

@@ -129,7 +129,13 @@ class PEARLPolicy(SACPolicy):
         )
         self.observation_space = observation_space
 
+    @property
+    def device(self) -> th.device:
+        """Where the networks are. SB3 looks for it among all parameters, which takes longer than to act."""
+        return self.latent_prior.mean.device
+
     def _build(self, lr_schedule: Schedule) -> None:
+        self.latent_prior = LatentPrior(self.latent_dim)
         super()._build(lr_schedule)
         self.encoder = ContextEncoder(self.context_dim, self.latent_dim, self.encoder_arch, self.activation_fn)
         self.encoder.optimizer = self.optimizer_class(
@@ -137,7 +143,6 @@ class PEARLPolicy(SACPolicy):
             lr=lr_schedule(1),  # type: ignore[call-arg]
             **self.optimizer_kwargs,
         )
-        self.latent_prior = LatentPrior(self.latent_dim)
         # z of predict() calls without a state: the prior mean
         self._z = th.zeros(1, self.latent_dim)
         self.critic_target.requires_grad_(False)
@@ -185,7 +190,9 @@ class PEARLPolicy(SACPolicy):
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         assert isinstance(observation, th.Tensor)
         obs = observation.flatten(1).float()
-        return self.actor(th.cat([obs, self._z.expand(len(obs), -1)], dim=1), deterministic)
+        mean, log_std, _ = self.actor.get_action_dist_params(th.cat([obs, self._z.expand(len(obs), -1)], dim=1))
+        # As the actor's distribution, which first checks its parameters for half of the time of a step
+        return th.tanh(mean if deterministic else mean + log_std.exp() * th.randn_like(mean))
 
     def set_training_mode(self, mode: bool) -> None:
         # predict() asks for it at every step, and telling all modules takes longer than the actor does
