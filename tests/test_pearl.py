@@ -89,11 +89,16 @@ def test_critic_gradients_do_not_leak_into_the_encoder_from_the_actor(tiny_pearl
 
 def test_the_precision_of_matrix_products_is_that_of_updates_only(tiny_pearl: MakePEARL, monkeypatch: Any) -> None:
     model = tiny_pearl(matmul_precision="medium")
-    seen = []
+    seen = set()
     update = model._update
-    monkeypatch.setattr(model, "_update", lambda size: (seen.append(th.get_float32_matmul_precision()), update(size))[1])
+
+    def watched(batch_size: int) -> Any:
+        seen.add(th.get_float32_matmul_precision())
+        return update(batch_size)
+
+    monkeypatch.setattr(model, "_update", watched)
     model.learn(ROLLOUT)
-    assert set(seen) == {"medium"} and th.get_float32_matmul_precision() == "highest"
+    assert seen == {"medium"} and th.get_float32_matmul_precision() == "highest"
 
 
 @pytest.mark.parametrize("n_envs", [1, 3, 5])

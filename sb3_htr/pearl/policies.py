@@ -94,7 +94,7 @@ class PEARLPolicy(SACPolicy):
     :param activation_fn: activation of all networks
     :param n_critics: number of critics
     :param optimizer_class: optimizer of all networks
-    :param optimizer_kwargs: its arguments, without the learning rate
+    :param optimizer_kwargs: its arguments, without the learning rate; Adam is fused unless told otherwise
     """
 
     def __init__(
@@ -112,6 +112,8 @@ class PEARLPolicy(SACPolicy):
     ) -> None:
         if latent_dim < 1:
             raise ValueError(f"latent_dim is {latent_dim}, expected at least 1.")
+        if optimizer_class is th.optim.Adam:
+            optimizer_kwargs = {"fused": True, **(optimizer_kwargs or {})}
         self.latent_dim = latent_dim
         self.encoder_arch = [128, 128] if encoder_arch is None else encoder_arch
         obs_dim = int(np.prod(observation_space.shape))
