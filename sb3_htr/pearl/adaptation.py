@@ -3,6 +3,7 @@
 import numpy as np
 import torch as th
 
+from sb3_htr.pearl.context import evenly_spread
 from sb3_htr.pearl.exploration import Explorer
 from sb3_htr.pearl.policies import PEARLPolicy
 from sb3_htr.pearl.task_search import TaskSearch
@@ -29,6 +30,8 @@ class Adaptation:
     :param n_envs: number of tasks
     :param explorer: how z is drawn before the posterior is used
     :param n_exploration_episodes: episodes before the posterior is used, for the explorer PRIOR
+    :param context_size: steps of an episode that the posterior is inferred from, evenly spread, at most: as many as in
+        meta-training, because each narrows it
     :param generator: source of randomness; torch's global one by default
     """
 
@@ -38,11 +41,13 @@ class Adaptation:
         n_envs: int,
         explorer: Explorer,
         n_exploration_episodes: int,
+        context_size: int,
         generator: th.Generator | None = None,
     ) -> None:
         self.policy = policy
         self.explorer = explorer
         self.n_exploration_episodes = n_exploration_episodes
+        self.context_size = context_size
         self.generator = generator
         self.n_episodes = np.zeros(n_envs, dtype=np.int64)
         # Return of the best episode, without the task-free part
@@ -137,8 +142,8 @@ class Adaptation:
         """Take the episodes that end into the posterior."""
         if len(envs) == 0:
             return
-        lengths = self._n_rows[envs]
-        rows = self._rows[envs][np.arange(self._rows.shape[1]) < lengths[:, None]]
+        steps, lengths = evenly_spread(self._n_rows[envs], self.context_size)
+        rows = self._rows[np.repeat(envs, lengths), steps]
         device = self.policy.device
         with th.no_grad():
             mean, variance = self.policy.encoder(th.as_tensor(rows, device=device), th.as_tensor(lengths, device=device))

@@ -404,7 +404,7 @@ class PEARL(AdaptsAtMetaTest, SavesToFiles):
         n_solved = min(len(self.task_bank.solved), prior.max_known_tasks)
         # A loaded model's known tasks are kept until this training knows as many
         if n_solved >= max(int(prior.n_known_tasks), 1):
-            best = self.task_bank.best_episodes(self.replay_buffer, prior.max_known_tasks)
+            best = self.task_bank.best_episodes(self.replay_buffer, prior.max_known_tasks, self.context_size)
             context, lengths, returns, first_success = best
             if self._vec_normalize_env is not None:
                 obs = slice(0, self.replay_buffer.obs_dim)
