@@ -7,7 +7,7 @@ import numpy as np
 from htr_envs.semicircle_goals import SemicircleGoalFamily
 from htr_envs.task_env import FloatArray
 
-ARENA = 10.0
+ARENA = 20.0  # a robot gets up to 10 in 200 steps
 
 
 class LocomotionFamily(SemicircleGoalFamily):
@@ -16,7 +16,7 @@ class LocomotionFamily(SemicircleGoalFamily):
     That is the point robot's reward at a larger scale: with the default radius a step within the goal is worth 0.5 to 1, far
     more than any cost of a step, so that a success stands out. Importing this needs no MuJoCo.
 
-    :param goal_distance: distance of the goals from the start, at most 10.
+    :param goal_distance: distance of the goals from the start, at most 20.
     :param goal_radius: a goal is reached where the distance to it is smaller than this, at most 1.
     :param n_train_tasks: how many training tasks.
     :param n_test_tasks: how many test tasks.

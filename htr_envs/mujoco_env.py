@@ -14,9 +14,9 @@ from htr_envs.task_env import BoolArray, FloatArray, TaskEnv
 from htr_envs.task_vector_env import TaskVectorEnv
 
 RENDER_MODES = ("human", "rgb_array")
-FRAME_SIZE = 480
+FRAME_WIDTH, FRAME_HEIGHT = 640, 400
 # From behind the start, looking down on the semicircle of goals
-CAMERA = {"lookat": np.array([0.0, 0.8, 0.0]), "distance": 5.5, "azimuth": 90.0, "elevation": -45.0}
+CAMERA = {"lookat": np.array([0.0, 0.9, 0.0]), "distance": 4.8, "azimuth": 90.0, "elevation": -45.0}
 
 
 class MujocoTaskEnv(TaskEnv):
@@ -61,7 +61,7 @@ class MujocoTaskEnv(TaskEnv):
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the robot, the start and the goal of the current episode, which is a disc of the goal radius.
 
-        :return: picture (480, 480, 3), uint8; None with ``"human"``, which shows it in a window, and without a render mode.
+        :return: picture (400, 640, 3), uint8; None with ``"human"``, which shows it in a window, and without a render mode.
         """
         if self.render_mode is None:
             return None
@@ -72,8 +72,7 @@ class MujocoTaskEnv(TaskEnv):
 
             self._render_data = mujoco.MjData(model)
             model.geom("goal").size[0] = self._goal_radius
-            size = FRAME_SIZE if self.render_mode == "rgb_array" else None
-            self._renderer = MujocoRenderer(model, self._render_data, dict(CAMERA), size, size, camera_id=-1)
+            self._renderer = MujocoRenderer(model, self._render_data, dict(CAMERA), FRAME_WIDTH, FRAME_HEIGHT, camera_id=-1)
         # data of its own: a picture changes nothing in the simulation
         mujoco.mj_setState(model, self._render_data, self._batch.states[0], FULL_PHYSICS)
         self._render_data.mocap_pos[0, :2] = self.task
