@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from typing import Any
 
 import mujoco
@@ -67,9 +69,12 @@ class MujocoTaskEnv(TaskEnv):
             return None
         model = self._batch.dynamics.model
         if self._renderer is None:
-            # imported here: headless machines that never render need no OpenGL
+            # imported here: who never renders needs no OpenGL
             from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 
+            if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+                # gymnasium would try to open a window first, which ends the process where there is no screen
+                os.environ.setdefault("MUJOCO_GL", "egl")
             self._render_data = mujoco.MjData(model)
             model.geom("goal").size[0] = self._goal_radius
             self._renderer = MujocoRenderer(model, self._render_data, dict(CAMERA), FRAME_WIDTH, FRAME_HEIGHT, camera_id=-1)

@@ -121,8 +121,8 @@ class WheeledEnv(MujocoTaskEnv):
     tasks overlap more, and more hindsight tasks contain the start, which are solved without moving.
 
     A uniformly random policy never reached its goal in 200,000 episodes that were measured. It gets 0.23 m away from the
-    start on average, 0.46 m in one episode of 20, 1.18 m in the best. A simple feedback controller that knows the goal is there
-    after 0.7 to 0.8 s, and stays.
+    start on average, 0.46 m in one episode of 20, 1.18 m in the best. A simple feedback controller that knows the goal is
+    there after 0.7 to 0.8 s, and stays.
 
     ## Starting State
 
