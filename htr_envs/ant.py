@@ -170,8 +170,8 @@ class AntEnv(MujocoTaskEnv):
     walk 2 metres. Because random actions lead further then, the radius is 0.4 here, where MAESN has 0.8: our choice.
 
     A uniformly random policy reaches the goal in 0.04 % of its episodes (13 of 30,000 measured; a radius of 0.5 would make it
-    0.13 %). It gets 0.80 m away from the start on average, 1.31 m in one episode of 20, 2.34 m in the best. An open-loop gait,
-    found by a short random search, walks 2 m in 44 steps and up to 7.9 m in an episode.
+    0.13 %). It gets 0.80 m away from the start on average, 1.31 m in one episode of 20, 2.34 m in the best. Open-loop gaits,
+    found by a short random search, walk 2 m in 44 steps and up to 7.9 m in an episode.
 
     ## Starting State
 
