@@ -54,6 +54,7 @@ class AntDynamics(MujocoDynamics):
 
     frame_skip = 5
     n_exact_positions = 2  # x, y
+    envs_per_thread = 4
 
     def __init__(
         self, ctrl_cost_weight: float, contact_cost_weight: float, healthy_reward: float, reset_noise_scale: float
@@ -170,8 +171,8 @@ class AntEnv(MujocoTaskEnv):
     walk 2 metres. Because random actions lead further then, the radius is 0.4 here, where MAESN has 0.8: our choice.
 
     A uniformly random policy reaches the goal in 0.04 % of its episodes (13 of 30,000 measured; a radius of 0.5 would make it
-    0.13 %). It gets 0.80 m away from the start on average, 1.31 m in one episode of 20, 2.34 m in the best. An open-loop gait,
-    found by a short random search, walks 2 m in 44 steps and up to 7.9 m in an episode.
+    0.13 %). It gets 0.80 m away from the start on average, 1.31 m in one episode of 20, 2.34 m in the best. Open-loop gaits,
+    found by a short random search, walk 2 m in 44 steps and up to 7.9 m in an episode.
 
     ## Starting State
 
@@ -207,8 +208,9 @@ class AntEnv(MujocoTaskEnv):
     | `task_seed`           | `1337`     | seed of the task sets, apart from the run's seed                 |
 
     `gymnasium.make_vec("SparseAnt-v0", n)` steps n ants in native threads. It takes `n_threads` as well, by default
-    `OMP_NUM_THREADS` if that is set, else one for each CPU. `reset(options={"task_id": i})` or
-    `reset(options={"task": [x, y]})` gives the env a task, which stays until it is changed.
+    `OMP_NUM_THREADS` if that is set, else one for each CPU, with at least 4 ants for each thread.
+    `reset(options={"task_id": i})` or `reset(options={"task": [x, y]})` gives the env a task, which stays until it is
+    changed.
 
     ## Version History
 
@@ -238,8 +240,8 @@ class AntVectorEnv(MujocoTaskVectorEnv):
     :param num_envs: how many ants.
     :param max_episode_steps: steps after which an episode is truncated, None for never.
     :param reward_type: reward of ``step``, ``"sparse"`` or ``"dense"``.
-    :param n_threads: how many threads step the ants, None for ``OMP_NUM_THREADS`` if that is set, else one for each CPU that
-        this process may use. The results do not depend on it.
+    :param n_threads: how many threads step the ants; the results do not depend on it. None for ``OMP_NUM_THREADS`` if that
+        is set, else one for each CPU that this process may use, but for no more than have enough to do.
     :param ctrl_cost_weight: weight of the control cost.
     :param contact_cost_weight: weight of the contact cost.
     :param healthy_reward: reward of each step that ends healthy.

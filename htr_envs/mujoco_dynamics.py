@@ -45,6 +45,8 @@ class MujocoDynamics(ABC):
     """Physics steps in a control step."""
     n_exact_positions: ClassVar[int]
     """So many leading positions start without noise."""
+    envs_per_thread: ClassVar[int]
+    """With fewer copies for each thread, waking the threads takes longer than they save (measured)."""
 
     def __init__(self, spec: mujoco.MjSpec, reset_noise_scale: float, observation_bounds: FloatArray) -> None:
         if not reset_noise_scale >= 0.0:
@@ -209,8 +211,8 @@ class MujocoBatch:
         self._rollout, self._data = None, []
 
 
-def default_n_threads() -> int:
-    """How many threads to use where nobody says it.
+def available_threads() -> int:
+    """How many threads a process should use.
 
     :return: the environment variable ``OMP_NUM_THREADS`` if it is set, else the number of CPUs that this process may use.
     :raises ValueError: if the variable is no number.

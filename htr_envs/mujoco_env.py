@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from htr_envs.mujoco_dynamics import FULL_PHYSICS, MujocoBatch, MujocoDynamics, default_n_threads
+from htr_envs.mujoco_dynamics import FULL_PHYSICS, MujocoBatch, MujocoDynamics, available_threads
 from htr_envs.semicircle_goals import SemicircleGoalFamily
 from htr_envs.task_env import BoolArray, FloatArray, TaskEnv
 from htr_envs.task_vector_env import TaskVectorEnv
@@ -101,8 +101,8 @@ class MujocoTaskVectorEnv(TaskVectorEnv):
     :param num_envs: how many robots.
     :param max_episode_steps: steps after which an episode is truncated, None for never.
     :param reward_type: reward of ``step``, ``"sparse"`` or ``"dense"``.
-    :param n_threads: how many threads step the robots, None for ``OMP_NUM_THREADS`` if that is set, else one for each CPU that
-        this process may use. The results do not depend on it.
+    :param n_threads: how many threads step the robots; the results do not depend on it. None for ``OMP_NUM_THREADS`` if that
+        is set, else one for each CPU that this process may use, but for no more than have enough to do.
     :raises ValueError: if the reward type is unknown or a number is smaller than 1.
     """
 
@@ -118,7 +118,7 @@ class MujocoTaskVectorEnv(TaskVectorEnv):
         spaces = dynamics.observation_space, dynamics.action_space
         super().__init__(task_family, num_envs, *spaces, max_episode_steps, reward_type)
         if n_threads is None:
-            n_threads = default_n_threads()
+            n_threads = min(available_threads(), max(1, num_envs // dynamics.envs_per_thread))
         if n_threads < 1:
             raise ValueError(f"n_threads is {n_threads}: pass at least 1, or None for as many as there are CPUs.")
         self._batch = MujocoBatch(dynamics, num_envs, n_threads)

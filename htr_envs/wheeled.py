@@ -27,6 +27,7 @@ class WheeledDynamics(MujocoDynamics):
 
     frame_skip = 2
     n_exact_positions = 3  # x, y, and z, with which the robot stands on the floor
+    envs_per_thread = 32
 
     def __init__(self, ctrl_cost_weight: float, reset_noise_scale: float) -> None:
         bounds = [ARENA, ARENA, 1.0, 1.0, TOP_SPEED, TOP_SPEED, TOP_TURN_RATE, TOP_SPEED, TOP_SPEED]
@@ -158,8 +159,9 @@ class WheeledEnv(MujocoTaskEnv):
     only few steps see, it would pay to stand still. The default costs at most 0.01 a step.
 
     `gymnasium.make_vec("SparseWheeled-v0", n)` steps n robots in native threads. It takes `n_threads` as well, by default
-    `OMP_NUM_THREADS` if that is set, else one for each CPU. `reset(options={"task_id": i})` or
-    `reset(options={"task": [x, y]})` gives the env a task, which stays until it is changed.
+    `OMP_NUM_THREADS` if that is set, else one for each CPU, with at least 32 robots for each thread.
+    `reset(options={"task_id": i})` or `reset(options={"task": [x, y]})` gives the env a task, which stays until it is
+    changed.
 
     ## Version History
 
@@ -186,8 +188,8 @@ class WheeledVectorEnv(MujocoTaskVectorEnv):
     :param num_envs: how many robots.
     :param max_episode_steps: steps after which an episode is truncated, None for never.
     :param reward_type: reward of ``step``, ``"sparse"`` or ``"dense"``.
-    :param n_threads: how many threads step the robots, None for ``OMP_NUM_THREADS`` if that is set, else one for each CPU that
-        this process may use. The results do not depend on it.
+    :param n_threads: how many threads step the robots; the results do not depend on it. None for ``OMP_NUM_THREADS`` if that
+        is set, else one for each CPU that this process may use, but for no more than have enough to do.
     :param ctrl_cost_weight: weight of the control cost.
     :param reset_noise_scale: noise of the starting state.
     :param family_kwargs: arguments of :class:`htr_envs.LocomotionFamily`.

@@ -20,7 +20,7 @@ from sb3_htr.common.vec_env import make_task_vec_env
 mujoco = pytest.importorskip("mujoco")
 
 from htr_envs.ant import AntEnv, AntVectorEnv  # noqa: E402
-from htr_envs.mujoco_dynamics import FULL_PHYSICS, default_n_threads  # noqa: E402
+from htr_envs.mujoco_dynamics import FULL_PHYSICS, available_threads  # noqa: E402
 from htr_envs.mujoco_env import MujocoTaskEnv, MujocoTaskVectorEnv  # noqa: E402
 from htr_envs.wheeled import WHEEL_RADIUS, WheeledEnv, WheeledVectorEnv  # noqa: E402
 
@@ -169,13 +169,15 @@ def test_threads_start_with_the_first_step_and_end_with_close() -> None:
 def test_the_default_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     for value, expected in (("1", 1), ("3", 3), ("2,1", 2)):
         monkeypatch.setenv("OMP_NUM_THREADS", value)
-        assert default_n_threads() == expected
+        assert available_threads() == expected
+        assert make_vec(ANT, 64)._batch.n_threads == expected
+        assert make_vec(WHEELED, 16)._batch.n_threads == 1
     for value in ("many", "0", "-1"):
         monkeypatch.setenv("OMP_NUM_THREADS", value)
         with pytest.raises(ValueError, match="OMP_NUM_THREADS"):
             make_vec(WHEELED, 2)
     monkeypatch.delenv("OMP_NUM_THREADS")
-    assert 1 <= default_n_threads() <= (os.cpu_count() or 1)
+    assert 1 <= available_threads() <= (os.cpu_count() or 1)
 
 
 @both_envs
