@@ -5,6 +5,8 @@ from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_htr.common.linear import with_fast_linear
+
 # Smallest variance of a factor, as in PEARL's reference implementation
 MIN_VARIANCE = 1e-7
 
@@ -55,7 +57,7 @@ class ContextEncoder(nn.Module):
     ) -> None:
         super().__init__()
         self.latent_dim = latent_dim
-        self.factors = nn.Sequential(*create_mlp(context_dim, 2 * latent_dim, net_arch, activation_fn))
+        self.factors = with_fast_linear(nn.Sequential(*create_mlp(context_dim, 2 * latent_dim, net_arch, activation_fn)))
 
     def forward(self, context: th.Tensor, lengths: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
