@@ -13,7 +13,7 @@ from sb3_htr import PEARL
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.vec_env import make_task_vec_env
 
-PRODUCTS = {"aten::mm", "aten::bmm", "aten::addmm", "aten::baddbmm"}
+PRODUCTS = {"aten::mm", "aten::addmm", "mkldnn::_linear_pointwise"}
 # What the profiler cannot see into, by the name that it gets here
 PARTS = {
     "drawing meta-batches": "replay_buffer.sample",
@@ -22,7 +22,7 @@ PARTS = {
     "choosing actions": "policy.predict",
     "best episodes of training tasks": "task_bank.update",
     "known tasks": "_update_latent_prior",
-    "updates, what is not torch": "_update",
+    "Python between the operations of updates": "_update",
 }
 
 
@@ -57,7 +57,7 @@ def main() -> None:
         name = event.key
         if name in PRODUCTS:
             name = "matrix products"
-        elif "Backward" in name or name.startswith("autograd::"):
+        elif "Backward" in name or name.startswith(("autograd::", "_OneDNN")):
             name = "autograd"
         elif name.startswith("Optimizer"):
             name = "Adam"

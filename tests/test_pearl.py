@@ -101,6 +101,16 @@ def test_the_precision_of_matrix_products_is_that_of_updates_only(tiny_pearl: Ma
     assert seen == {"medium"} and th.get_float32_matmul_precision() == "highest"
 
 
+def test_sampled_actions_are_those_of_the_distribution_of_sac(tiny_pearl: MakePEARL) -> None:
+    policy = tiny_pearl().policy
+    obs_z = 3 * th.randn(100, 2 + policy.latent_dim)
+    actions, log_prob = policy.sample_actions(obs_z)
+    mean, log_std, _ = policy.actor.get_action_dist_params(obs_z)
+    distribution = policy.actor.action_dist.proba_distribution(mean, log_std)
+    th.testing.assert_close(log_prob, distribution.log_prob(actions), rtol=1e-3, atol=1e-3)
+    th.testing.assert_close(policy._act(obs_z, deterministic=True), distribution.mode())
+
+
 @pytest.mark.parametrize("n_envs", [1, 3, 5])
 def test_any_number_of_envs(tiny_pearl: MakePEARL, n_envs: int) -> None:
     """4 tasks on n envs take ceil(4 / n) rounds of 3 episodes each."""

@@ -52,8 +52,8 @@ class Linear(nn.Linear):
     """
     ``nn.Linear`` with the same parameters and results, for batches of rows (n, in_features).
 
-    Elsewhere than on a CPU with oneDNN, for few rows, for other than float32, and where ``torch.set_float32_matmul_precision`` allows less
-    than that, it is ``nn.Linear``.
+    Elsewhere than on a CPU with oneDNN, for few rows, for other than float32, and where
+    ``torch.set_float32_matmul_precision`` allows less than that, it is ``nn.Linear``.
     """
 
     def forward(self, x: th.Tensor) -> th.Tensor:

@@ -318,13 +318,8 @@ class PEARL(AdaptsAtMetaTest, SavesToFiles):
         if self.ent_coef_optimizer is not None:
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
-        try:
-            with matmul_precision(self.matmul_precision):
-                means, logs = zip(*(self._update(batch_size) for _ in range(gradient_steps)), strict=True)
-        except ValueError:
-            # torch's distributions refuse what is not finite, in many lines
-            check_finite(self.policy, {}, self._n_updates, self.num_timesteps)
-            raise
+        with matmul_precision(self.matmul_precision):
+            means, logs = zip(*(self._update(batch_size) for _ in range(gradient_steps)), strict=True)
         log_means = {key: th.stack([log[key] for log in logs]).mean().item() for key in logs[0]}
         check_finite(self.policy, log_means, self._n_updates, self.num_timesteps)
         self._posterior_watch.check(log_means["kl_divergence"])
@@ -355,7 +350,7 @@ class PEARL(AdaptsAtMetaTest, SavesToFiles):
         ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp()
         with th.no_grad():
             next_obs_z = th.cat([data.next_observations, z_rows], dim=1)
-            next_actions, next_log_prob = self.actor.action_log_prob(next_obs_z)
+            next_actions, next_log_prob = self.policy.sample_actions(next_obs_z)
             next_q = self.critic_target(next_obs_z, next_actions).amin(dim=0) - ent_coef * next_log_prob
             target_q = data.rewards + (1 - data.dones) * self.gamma * next_q
         q = self.critic(obs_z, data.actions)
@@ -368,7 +363,7 @@ class PEARL(AdaptsAtMetaTest, SavesToFiles):
 
         # The actor sees z, but does not shape it
         obs_z = obs_z.detach()
-        actions_pi, log_prob = self.actor.action_log_prob(obs_z)
+        actions_pi, log_prob = self.policy.sample_actions(obs_z)
         actor_loss = ((ent_coef * log_prob - self.critic(obs_z, actions_pi).amin(dim=0)) * weight).sum()
         self.actor.optimizer.zero_grad()
         # The critics' weights get no gradient, and none is computed

@@ -1,5 +1,6 @@
 """Networks of PEARL: SAC's actor and critics conditioned on the task variable z, and the context encoder."""
 
+import math
 from itertools import pairwise
 from typing import Any
 
@@ -189,13 +190,28 @@ class PEARLPolicy(SACPolicy):
             return self._act(obs_z, deterministic=False).cpu().numpy()
 
     def _act(self, obs_z: th.Tensor, deterministic: bool) -> th.Tensor:
+        mean, log_std = self._gaussian(obs_z)
+        return th.tanh(mean if deterministic else mean + log_std.exp() * th.randn_like(mean))
+
+    def sample_actions(self, obs_z: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        The actor's ``action_log_prob`` without torch's distributions, whose checks take longer than the sampling.
+
+        :param obs_z: (n, obs_dim + latent_dim)
+        :return: actions (n, action_dim) in (-1, 1), and the logarithm of their density (n,), both differentiable
+        """
+        mean, log_std = self._gaussian(obs_z)
+        noise = th.randn_like(mean)
+        actions = th.tanh(mean + log_std.exp() * noise)
+        log_prob = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
+        # The density of tanh(x); SB3's epsilon
+        return actions, (log_prob - th.log(1.0 - actions.square() + 1e-6)).sum(dim=1)
+
+    def _gaussian(self, obs_z: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Mean and log standard deviation of the actions before tanh."""
         hidden = self.actor.latent_pi(obs_z)
-        mean = self.actor.mu(hidden)
-        if deterministic:
-            return th.tanh(mean)
-        # As the actor's distribution, which first checks its parameters for half of the time of a step
         log_std = self.actor.log_std(hidden).clamp(LOG_STD_MIN, LOG_STD_MAX)  # type: ignore[operator]
-        return th.tanh(mean + log_std.exp() * th.randn_like(mean))
+        return self.actor.mu(hidden), log_std
 
     def set_training_mode(self, mode: bool) -> None:
         # predict() asks for it at every step, and telling all modules takes longer than the actor does
