@@ -11,6 +11,7 @@ import pytest
 import torch as th
 from conftest import ENV_ID, TINY
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.utils import LinearSchedule
@@ -103,11 +104,13 @@ def test_the_precision_of_matrix_products_is_that_of_updates_only(tiny_pearl: Ma
 
 def test_sampled_actions_are_those_of_the_distribution_of_sac(tiny_pearl: MakePEARL) -> None:
     policy = tiny_pearl().policy
-    obs_z = 3 * th.randn(100, 2 + policy.latent_dim)
+    obs_z = th.randn(1000, 2 + policy.latent_dim)
     actions, log_prob = policy.sample_actions(obs_z)
     mean, log_std, _ = policy.actor.get_action_dist_params(obs_z)
-    distribution = policy.actor.action_dist.proba_distribution(mean, log_std)
-    th.testing.assert_close(log_prob, distribution.log_prob(actions), rtol=1e-3, atol=1e-3)
+    distribution = SquashedDiagGaussianDistribution(2).proba_distribution(mean, log_std)
+    inside = (actions.abs() < 0.99).all(dim=1)  # at the edges, tanh cannot be undone in float32
+    assert inside.sum() > 500
+    th.testing.assert_close(log_prob[inside], distribution.log_prob(actions)[inside], rtol=1e-3, atol=1e-3)
     th.testing.assert_close(policy._act(obs_z, deterministic=True), distribution.mode())
 
 
