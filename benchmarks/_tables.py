@@ -26,6 +26,22 @@ def table(content: dict[str, Any]) -> str:
     return f"{text}\n\n`{content['command']}`, {content['date']}, {content['machine']}.\n"
 
 
+def summary(contents: list[dict[str, Any]]) -> str:
+    """
+    :param contents: of result files
+    :return: Markdown table of the figures that had a goal, on one thread where there are several, against other libraries
+    """
+    lines = ["| | ours | times as fast as | |", "| --- | --- | --- | --- |"]
+    for content in contents:
+        for row in content.get("rows", []):
+            other_library = row["against"].startswith(("SB3", "katerakelly"))
+            if row["goal"] and other_library and "float32, 2 thread" not in row["name"] and "products, 2" not in row["name"]:
+                ours = f"{row['ours']:,.{_decimals(row['ours'])}f} {row['unit']}"
+                name = f"{content['name']}: {row['name'].removesuffix(', 1 thread(s)')}"
+                lines.append(f"| {name} | {ours} | {row['ratio']:.1f} | {row['against']} |")
+    return "\n".join(lines) + f"\n\n`make bench`, {contents[0]['machine']}.\n"
+
+
 def shares(content: dict[str, Any]) -> str:
     """
     :param content: of a profile
@@ -44,6 +60,7 @@ def main() -> None:
     """All benchmarks that were run."""
     contents = [json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))]
     tables = {f"benchmark:{c['name']}": shares(c) if "shares" in c else table(c) for c in contents}
+    tables["benchmarks"] = summary(contents)
     fill([ROOT / "README.md", ROOT / "docs" / "performance.md"], tables)
 
 
