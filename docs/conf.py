@@ -8,6 +8,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from htr_envs import PointRobotEnv, TargetSpeedEnv
+from htr_envs.ant import AntEnv
+from htr_envs.wheeled import WheeledEnv
 
 HERE = Path(__file__).parent
 
@@ -34,7 +36,8 @@ def picture(env_id: str, task: list[float], actions: np.ndarray) -> np.ndarray:
 
 # Docstrings of envs are Markdown, as in gymnasium: envs.md includes this copy
 (HERE / "_build").mkdir(exist_ok=True)
-for name, env in {"point_robot": PointRobotEnv, "target_speed": TargetSpeedEnv}.items():
+pages = {"point_robot": PointRobotEnv, "target_speed": TargetSpeedEnv, "wheeled": WheeledEnv, "ant": AntEnv}
+for name, env in pages.items():
     (HERE / "_build" / f"{name}.md").write_text(inspect.cleandoc(env.__doc__ or ""))
 # To the ring, then along it: the velocity is multiplied by 0.95 and gets 0.2 times the thrust
 angle = np.pi / 4 - 0.06 * np.arange(27)

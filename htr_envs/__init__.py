@@ -3,6 +3,7 @@
 from gymnasium.envs.registration import register
 
 from htr_envs.check_task_env import check_task_env
+from htr_envs.locomotion_family import LocomotionFamily
 from htr_envs.point_robot import PointRobotEnv, PointRobotFamily, PointRobotVectorEnv
 from htr_envs.semicircle_goals import SemicircleGoalFamily
 from htr_envs.target_speed import TargetSpeedEnv, TargetSpeedFamily, TargetSpeedVectorEnv
@@ -10,6 +11,7 @@ from htr_envs.task_env import TaskEnv, TaskFamily, Trajectory, at_step, check_re
 from htr_envs.task_vector_env import TaskVectorEnv
 
 __all__ = [
+    "LocomotionFamily",
     "PointRobotEnv",
     "PointRobotFamily",
     "PointRobotVectorEnv",
@@ -37,4 +39,17 @@ register(
     entry_point="htr_envs.target_speed:TargetSpeedEnv",
     vector_entry_point="htr_envs.target_speed:TargetSpeedVectorEnv",
     max_episode_steps=40,
+)
+# These two need MuJoCo, and are imported only when they are made.
+register(
+    id="SparseWheeled-v0",
+    entry_point="htr_envs.wheeled:WheeledEnv",
+    vector_entry_point="htr_envs.wheeled:WheeledVectorEnv",
+    max_episode_steps=200,
+)
+register(
+    id="SparseAnt-v0",
+    entry_point="htr_envs.ant:AntEnv",
+    vector_entry_point="htr_envs.ant:AntVectorEnv",
+    max_episode_steps=200,
 )

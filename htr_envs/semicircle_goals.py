@@ -58,9 +58,11 @@ class SemicircleGoalFamily(TaskFamily):
         return goals
 
     def _distance(self, traj: Trajectory, task: ArrayLike) -> FloatArray:
-        offset = traj.next_observations[..., :2] - np.asarray(task, dtype=np.float32)[..., None, :]
-        # not np.linalg.norm: its sum may be ordered by memory layout, and rewards must be the same bits for any batch shape
-        distance: FloatArray = np.sqrt(offset[..., 0] ** 2 + offset[..., 1] ** 2, dtype=np.float32)
+        goal = np.asarray(task, dtype=np.float32)[..., None, :]
+        # column by column, which is three times as fast; not np.linalg.norm: its sum may be ordered by memory layout, and
+        # rewards must be the same bits for any batch shape
+        x, y = (traj.next_observations[..., i] - goal[..., i] for i in (0, 1))
+        distance: FloatArray = np.sqrt(x * x + y * y, dtype=np.float32)
         return distance
 
     @abstractmethod

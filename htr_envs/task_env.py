@@ -57,10 +57,12 @@ def at_step(values: FloatArray, index: ArrayLike) -> FloatArray:
     :param index: which step, an int or an int array that broadcasts with the leading axes of ``values``.
     :return: the rows, shape (..., dim), float32, sharing no memory with ``values``.
     """
-    values = np.asarray(values, dtype=np.float32)
-    leading = np.broadcast_shapes(np.shape(index), values.shape[:-2])
+    values, steps = np.asarray(values, dtype=np.float32), np.asarray(index)
+    if steps.ndim == 0:
+        return values[..., int(steps), :].copy()
+    leading = np.broadcast_shapes(steps.shape, values.shape[:-2])
     values = np.broadcast_to(values, leading + values.shape[-2:])
-    indices = np.broadcast_to(np.asarray(index), leading)[..., None, None]
+    indices = np.broadcast_to(steps, leading)[..., None, None]
     return np.take_along_axis(values, indices, axis=-2)[..., 0, :]
 
 

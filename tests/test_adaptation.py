@@ -17,6 +17,7 @@ from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.common.evaluation import record_adaptation
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.pearl.adaptation import MAX_SETBACKS, Adaptation
+from sb3_htr.pearl.context import evenly_spread
 from sb3_htr.pearl.exploration import Explorer, LatentPrior
 from sb3_htr.pearl.policies import PEARLPolicy
 from sb3_htr.pearl.task_bank import TaskBank
@@ -170,7 +171,7 @@ def play(adaptation: Adaptation, rewards: list[list[float]], length: int = 3) ->
 def test_search_tries_every_known_task_once_until_a_reward(tiny_pearl: MakePEARL) -> None:
     policy = tiny_pearl().policy
     z_known = known_tasks(policy).z
-    adaptation = Adaptation(policy, 2, Explorer.SEARCH, 0, th.Generator().manual_seed(0))
+    adaptation = Adaptation(policy, 2, Explorer.SEARCH, 0, 64, th.Generator().manual_seed(0))
     z = np.stack(play(adaptation, [[0, 0], [0, 5], [0, 4], [0, 4]])[:4])
     assert sorted(map(tuple, z[:, 0])) == sorted(map(tuple, z_known)), "the first env has seen no reward"
     visited = (z[:, 1, None] == z_known).all(axis=2).any(axis=1)
@@ -182,7 +183,7 @@ def test_search_tries_every_known_task_once_until_a_reward(tiny_pearl: MakePEARL
 def test_a_visit_that_fails_turns_to_another_within_the_episode(tiny_pearl: MakePEARL) -> None:
     policy = tiny_pearl().policy
     z_known = known_tasks(policy, n=8, first_success=3).z
-    adaptation = Adaptation(policy, 1, Explorer.SEARCH, 0, th.Generator().manual_seed(0))
+    adaptation = Adaptation(policy, 1, Explorer.SEARCH, 0, 64, th.Generator().manual_seed(0))
     first = adaptation.z.copy()
     rows, nothing = np.zeros((1, 2), dtype=np.float32), np.zeros(1)
     seen = []
@@ -205,7 +206,7 @@ def test_an_episode_of_several_visits_is_no_success_to_settle_on(tiny_pearl: Mak
     """Acting with its last z from the start may find nothing."""
     policy = tiny_pearl().policy
     known_tasks(policy, n=8, first_success=1)
-    adaptation = Adaptation(policy, 1, Explorer.SEARCH, 0, th.Generator().manual_seed(0))
+    adaptation = Adaptation(policy, 1, Explorer.SEARCH, 0, 64, th.Generator().manual_seed(0))
     rows, nothing = np.zeros((1, 2), dtype=np.float32), np.zeros(1)
     for step in range(6):
         adaptation.observe(rows, rows, np.array([9.0 * (step == 5)]), nothing, np.array([step == 5]))
@@ -217,7 +218,7 @@ def test_an_episode_of_several_visits_is_no_success_to_settle_on(tiny_pearl: Mak
 def test_search_settles_on_the_best_episode_after_setbacks(tiny_pearl: MakePEARL) -> None:
     policy = tiny_pearl().policy
     known_tasks(policy, n=12)
-    adaptation = Adaptation(policy, 1, Explorer.SEARCH, 0, th.Generator().manual_seed(0))
+    adaptation = Adaptation(policy, 1, Explorer.SEARCH, 0, 64, th.Generator().manual_seed(0))
     z = play(adaptation, [[0.0], [5.0], *[[1.0] for _ in range(MAX_SETBACKS)], [5.0], [5.0]])
     for episode in range(2, 2 + MAX_SETBACKS):
         assert (z[episode] != z[1]).any()
@@ -231,7 +232,7 @@ def test_the_posterior_of_search_sees_the_best_episode_only(tiny_pearl: MakePEAR
     ends = []
     for length_of_miss in (2, 7):
         # Without known tasks, only the posterior is used
-        adaptation = Adaptation(policy, 1, Explorer.SEARCH, 0, th.Generator().manual_seed(0))
+        adaptation = Adaptation(policy, 1, Explorer.SEARCH, 0, 64, th.Generator().manual_seed(0))
         play(adaptation, [[0]], length_of_miss)
         adaptation.generator = th.Generator().manual_seed(1)
         ends.append(play(adaptation, [[1]])[-1])
@@ -240,7 +241,7 @@ def test_the_posterior_of_search_sees_the_best_episode_only(tiny_pearl: MakePEAR
 
 def test_prior_explores_for_a_fixed_number_of_episodes(tiny_pearl: MakePEARL) -> None:
     policy = tiny_pearl().policy
-    adaptation = Adaptation(policy, 1, Explorer.PRIOR, 3, th.Generator().manual_seed(0))
+    adaptation = Adaptation(policy, 1, Explorer.PRIOR, 3, 64, th.Generator().manual_seed(0))
     exploring = []
     for returns in ([1.0], [0.0], [0.0], [0.0]):
         exploring.append(bool(adaptation.exploring()[0]))
@@ -312,25 +313,49 @@ def test_known_tasks_are_those_that_were_ever_reached(tiny_pearl: MakePEARL) -> 
     model.learn(4 * ROLLOUT)
     bank, buffer = model.task_bank, model.replay_buffer
     assert isinstance(bank, TaskBank) and buffer is not None and len(bank.solved) > 20
-    context, mask, returns, first_success = bank.best_episodes(buffer, 128)
+    rows, lengths, returns, first_success = bank.best_episodes(buffer, 128, 20)
+    assert (lengths == 20).all()
+    context = rows.reshape(len(lengths), 20, -1)
     tasks = bank.task_family.train_tasks[bank.solved]
     position = context[..., :2] + 0.1 * np.clip(context[..., 2:4], -1, 1)
     distance = np.linalg.norm(position[:, None] - tasks[:, None], axis=-1)
-    reward = np.where(distance < 0.2, 1 - distance, 0) * mask[:, None]
+    reward = np.where(distance < 0.2, 1 - distance, 0)
     np.testing.assert_allclose(returns, reward.sum(axis=-1), atol=0.9)  # a step on the rim may count or not
     assert (np.diag(returns) > 0).all() and (np.diag(first_success) < 20).all()
     np.testing.assert_array_equal(np.isfinite(first_success), returns > 0)
-    np.testing.assert_allclose(context[..., -1] * mask, np.einsum("iit->it", reward), atol=0.9)
+    np.testing.assert_allclose(context[..., -1], np.einsum("iit->it", reward), atol=0.9)
     known = model.policy.latent_prior.known_tasks()
     np.testing.assert_array_equal(known.returns, returns)
-    fewer = bank.best_episodes(buffer, 7)
-    assert [len(array) for array in fewer] == [7] * 4
+    fewer = bank.best_episodes(buffer, 7, 5)
+    assert [len(array) for array in fewer] == [7 * 5, 7, 7, 7]
+
+
+@given(st.lists(st.integers(1, 300), min_size=1, max_size=6), st.integers(1, 40))
+def test_contexts_are_spread_over_their_episodes(lengths: list[int], size: int) -> None:
+    steps, taken = evenly_spread(np.array(lengths), size)
+    assert taken.tolist() == [min(length, size) for length in lengths]
+    for episode, length in zip(np.split(steps, np.cumsum(taken)[:-1]), lengths, strict=True):
+        # As far from each other as from the ends, up to rounding
+        gaps = np.diff(np.concatenate([[-1 - episode[0]], episode, [2 * length - 1 - episode[-1]]]))
+        assert episode.min() >= 0 and episode.max() < length and np.ptp(gaps) <= 2
+        assert length > size or (episode == np.arange(length)).all()
+
+
+def test_a_long_episode_narrows_the_posterior_as_much_as_a_context_of_training(tiny_pearl: MakePEARL) -> None:
+    policy = tiny_pearl().policy
+    adaptation = Adaptation(policy, 1, Explorer.AGGREGATE, 0, 5, th.Generator().manual_seed(0))
+    rows = np.random.default_rng(0).normal(size=(50, 1, 5)).astype(np.float32)
+    rows[..., -1] = 1.0
+    for i, row in enumerate(rows):
+        adaptation.observe(row[:, :2], row[:, 2:4], row[:, 4], np.zeros(1), np.array([i == 49]))
+    _, variance = policy.encoder(th.tensor(rows[[5, 15, 25, 35, 45], 0]), th.tensor([5]))
+    np.testing.assert_allclose(1 / adaptation._precision, variance.detach().numpy(), rtol=1e-5)
 
 
 def test_the_frozen_agent_acts_with_what_is_known_to_work(tiny_pearl: MakePEARL) -> None:
     policy = tiny_pearl().policy
     known_tasks(policy)
-    adaptation = Adaptation(policy, 2, Explorer.SEARCH, 0, th.Generator().manual_seed(0))
+    adaptation = Adaptation(policy, 2, Explorer.SEARCH, 0, 64, th.Generator().manual_seed(0))
     z = play(adaptation, [[0.0, 0.0], [5.0, 0.0], [1.0, 0.0]])
     np.testing.assert_array_equal(adaptation.frozen_z()[0], z[1][0])
     np.testing.assert_array_equal(adaptation.frozen_z()[1], adaptation.z[1])  # nothing is known to work

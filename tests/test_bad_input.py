@@ -86,6 +86,7 @@ def test_an_unknown_id_is_gymnasiums_business(tiny_pearl: MakePEARL) -> None:
         ({"replay_buffer_kwargs": {"grid": 1}}, "replay_buffer_kwargs has no setting 'grid': expected one of"),
         ({"explorer": "random"}, "explorer is 'random', expected one of"),
         ({"train_explorer": "random"}, "explorer is 'random'"),
+        ({"matmul_precision": "bf16"}, r"matmul_precision is 'bf16', expected one of \['highest', 'high', 'medium'\]"),
         ({"policy_kwargs": {"latent_dim": 0}}, "latent_dim is 0, expected at least 1"),
         ({"replay_buffer_kwargs": {"relabel_probability": -1}}, "relabel_probability is -1"),
         ({"buffer_size": 10}, "buffer_size is 10, too small"),

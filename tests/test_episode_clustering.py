@@ -41,10 +41,11 @@ def test_real_buffers_are_as_they_would_be_without() -> None:
     assert buffer.size() == 60 * 20 and buffer.n_episodes.sum() == 60
     assert len(buffer.episodes.take_new()[0]) == 60, "copies are not new experience"
     plain = buffer.sample(8, meta_batch_size=200, context_size=20)
-    real = ~plain.relabelled
-    traj_reward = plain.rewards.numpy()[real]
-    distance = np.linalg.norm(plain.next_observations.numpy() - FAMILY.train_tasks[plain.task_ids][:, None], axis=-1)[real]
-    np.testing.assert_allclose(traj_reward, np.where(distance < 0.2, 1 - distance, 0), atol=1e-5)
+    task = np.repeat(np.arange(200), plain.lengths.numpy())
+    real = ~plain.relabelled[task]
+    distance = np.linalg.norm(plain.next_observations.numpy() - FAMILY.train_tasks[plain.task_ids[task]], axis=-1)
+    expected = np.where(distance < 0.2, 1 - distance, 0)
+    np.testing.assert_allclose(plain.rewards.numpy()[real], expected[real], atol=1e-5)
 
 
 def test_a_hindsight_buffer_holds_the_rewards_of_its_task() -> None:

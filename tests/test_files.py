@@ -18,6 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_htr import PEARL, evaluate_adaptation, load_untrusted
+from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr import EpisodeClustering
 from sb3_htr.pearl.files import SavesToFiles
@@ -140,3 +141,11 @@ def test_streams_work_as_files_do(tiny_pearl: MakePEARL) -> None:
     loaded = PEARL.load(model_file, env=make_task_vec_env(ENV_ID, 4))
     loaded.load_replay_buffer(buffer_file)
     assert loaded.replay_buffer is not None and loaded.replay_buffer.size() == model.replay_buffer.size()
+
+
+def test_a_file_does_not_replace_a_folder(tmp_path: Path) -> None:
+    (tmp_path / "model.zip").mkdir()
+    (tmp_path / "model.zip" / "precious").touch()
+    with pytest.raises(OSError), atomic_path(tmp_path / "model.zip") as temporary:
+        temporary.touch()
+    assert [path.name for path in tmp_path.rglob("*")] == ["model.zip", "precious"]

@@ -80,10 +80,11 @@ def test_add_and_sample(data: st.DataObject) -> None:
             buffer.sample(sizes[0], meta_batch_size=sizes[1], context_size=sizes[2])
         return
     sample = buffer.sample(sizes[0], meta_batch_size=sizes[1], context_size=sizes[2])
-    assert sample.observations.shape == (sizes[1], sizes[0], 2) and sample.context.shape == (sizes[1], sizes[2], 5)
+    assert sample.observations.shape == (sample.lengths.sum(), 2) and sample.context.shape == (sample.context_lengths.sum(), 5)
     assert all(np.isfinite(np.asarray(tensor)).all() for tensor in sample)
     assert (buffer.n_episodes[sample.task_ids] > 0).all()
-    assert (sample.context_mask.sum(dim=1) >= 1).all()
+    for lengths, largest in ((sample.lengths, sizes[0]), (sample.context_lengths, sizes[2])):
+        assert len(lengths) == sizes[1] and (lengths >= 1).all() and (lengths <= largest).all()
 
 
 @many

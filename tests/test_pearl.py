@@ -11,6 +11,7 @@ import pytest
 import torch as th
 from conftest import ENV_ID, TINY
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.utils import LinearSchedule
@@ -78,13 +79,39 @@ def test_critic_gradients_do_not_leak_into_the_encoder_from_the_actor(tiny_pearl
     model._update_learning_rate = lambda optimizers: None  # type: ignore[method-assign]
     model.encoder.optimizer.param_groups[0]["lr"] = 1e-2
     data = model.replay_buffer.sample(4)  # type: ignore[union-attr]
-    z = model.encoder(data.context, data.context_mask)[0].detach()
+    z = model.encoder(data.context, data.context_lengths)[0].detach()
     assert not z.requires_grad
     model.train(1)
     after = parameters(model)
     assert all(th.equal(before[n], after[n]) for n in before if n.startswith("critic."))
     assert any(not th.equal(before[n], after[n]) for n in before if n.startswith("actor."))
     assert all(p.grad is not None and p.requires_grad for p in model.critic.parameters())
+
+
+def test_the_precision_of_matrix_products_is_that_of_updates_only(tiny_pearl: MakePEARL, monkeypatch: Any) -> None:
+    model = tiny_pearl(matmul_precision="medium")
+    seen = set()
+    update = model._update
+
+    def watched(batch_size: int) -> Any:
+        seen.add(th.get_float32_matmul_precision())
+        return update(batch_size)
+
+    monkeypatch.setattr(model, "_update", watched)
+    model.learn(ROLLOUT)
+    assert seen == {"medium"} and th.get_float32_matmul_precision() == "highest"
+
+
+def test_sampled_actions_are_those_of_the_distribution_of_sac(tiny_pearl: MakePEARL) -> None:
+    policy = tiny_pearl().policy
+    obs_z = th.randn(1000, 2 + policy.latent_dim)
+    actions, log_prob = policy.sample_actions(obs_z)
+    mean, log_std, _ = policy.actor.get_action_dist_params(obs_z)
+    distribution = SquashedDiagGaussianDistribution(2).proba_distribution(mean, log_std)
+    inside = (actions.abs() < 0.99).all(dim=1)  # at the edges, tanh cannot be undone in float32
+    assert inside.sum() > 500
+    th.testing.assert_close(log_prob[inside], distribution.log_prob(actions)[inside], rtol=1e-3, atol=1e-3)
+    th.testing.assert_close(policy._act(obs_z, deterministic=True), distribution.mode())
 
 
 @pytest.mark.parametrize("n_envs", [1, 3, 5])

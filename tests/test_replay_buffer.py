@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch as th
 from conftest import add_episode, make_buffer
 from hypothesis import given
 from hypothesis import strategies as st
@@ -34,24 +35,25 @@ def assert_same(a: MultiTaskSamples, b: MultiTaskSamples) -> None:
 # --- spread: how rows are drawn
 
 
-@given(st.integers(0, 1000), st.lists(st.tuples(st.integers(0, 50), st.integers(1, 40)), min_size=1, max_size=5), st.data())
-def test_spread_stays_in_range_and_repeats_only_if_it_must(seed: int, ranges: list[tuple[int, int]], data: Any) -> None:
+@given(st.integers(0, 1000), st.lists(st.tuples(st.integers(0, 50), st.integers(1, 40)), min_size=1), st.integers(1, 60))
+def test_spread_draws_from_each_range_without_duplicates(seed: int, ranges: list[tuple[int, int]], width: int) -> None:
     start, length = np.array(ranges).T
-    width = data.draw(st.integers(1, 60))
-    size = np.array([data.draw(st.integers(1, width)) for _ in ranges])
-    drawn = spread(np.random.default_rng(seed), start, length, size, width)
-    assert drawn.shape == (len(ranges), width)
-    assert (drawn >= start[:, None]).all() and (drawn < (start + length)[:, None]).all()
-    for row, n, m in zip(drawn, size, length, strict=True):
-        counts = np.unique(row[:n], return_counts=True)[1]
-        assert counts.max() <= -(-n // m), "repeated more often than it must"
+    drawn, size = spread(np.random.default_rng(seed), np.stack([start, start + length], axis=1), width)
+    assert size.tolist() == np.minimum(length, width).tolist()
+    for values, first, n in zip(np.split(drawn, np.cumsum(size)[:-1]), start, length, strict=True):
+        assert values.min() >= first and values.max() < first + n
+        assert len(set(values)) == len(values)
 
 
 def test_spread_gives_every_row_the_same_chance() -> None:
     n = 20_000
-    drawn = spread(np.random.default_rng(0), np.zeros(n, int), np.full(n, 7), np.full(n, 3), 3)
-    frequency = np.bincount(drawn.ravel(), minlength=7) / n
-    np.testing.assert_allclose(frequency, 3 / 7, atol=0.02)
+    drawn, _ = spread(np.random.default_rng(0), np.tile([0, 7], (n, 1)), 3)
+    np.testing.assert_allclose(np.bincount(drawn, minlength=7) / n, 3 / 7, atol=0.02)
+
+
+def by_task(values: Any, lengths: Any) -> list[np.ndarray]:
+    """The rows of a sample, one array for each row of the meta-batch."""
+    return np.split(np.asarray(values), np.cumsum(np.asarray(lengths))[:-1])
 
 
 # --- storage
@@ -119,30 +121,25 @@ def test_every_reward_is_that_of_one_task_per_row(
     """Rows that are not relabelled keep the env's reward; relabelled ones carry the reward of one task that was reached."""
     buffer = filled(seed, lengths=lengths, relabel_probability=k, seed=seed, hindsight_task_strategy=strategy)
     data = buffer.sample(8, meta_batch_size=16, context_size=20)
-    assert all(np.asarray(x).dtype == np.float32 for x in data[:7])
-    own = FAMILY.train_tasks[data.task_ids]
-    traj = _context_traj(data)
-    valid = data.context_mask.numpy() == 1
-    reward = data.context[..., -1].numpy()
-    np.testing.assert_array_equal(
-        reward[~data.relabelled], FAMILY.compute_reward(traj, own)[~data.relabelled], err_msg="own task"
+    assert all(
+        x.dtype == (th.int64 if "lengths" in name else th.float32) for name, x in data._asdict().items() if th.is_tensor(x)
     )
-    # A relabelled context of a whole episode has the step that reached the hindsight task
-    assert ((reward > 0) & valid).any(axis=1)[data.relabelled].all()
-    for row in np.flatnonzero(data.relabelled):
-        reached = traj.next_observations[row]  # the task that a state solves is the place itself
-        candidates = FAMILY.compute_reward(_rows(traj, row), reached)
-        assert (candidates == reward[row]).all(axis=1).any(), "no reached state gives these rewards"
+    own = FAMILY.train_tasks[data.task_ids]
+    for row, context in enumerate(by_task(data.context, data.context_lengths)):
+        traj, reward = _traj(context), context[:, -1]
+        if not data.relabelled[row]:
+            np.testing.assert_array_equal(reward, FAMILY.compute_reward(traj, own[row]), err_msg="own task")
+        else:
+            # The whole episode, so the step that reached the hindsight task too
+            assert (reward > 0).any()
+            reached = traj.next_observations  # the task that a state solves is the place itself
+            candidates = FAMILY.compute_reward(type(traj)(*(x[None] for x in traj)), reached)
+            assert (candidates == reward).all(axis=1).any(), "no reached state gives these rewards"
 
 
-def _context_traj(data: MultiTaskSamples) -> Trajectory:
-    context = data.context.numpy()
-    obs, action = context[..., :2], context[..., 2:4]
-    return Trajectory(obs, action, (obs + 0.1 * action).astype(np.float32), np.zeros(obs.shape[:2], dtype=np.float32))
-
-
-def _rows(traj: Any, row: Any) -> Any:
-    return type(traj)(*(x[row][None] for x in traj))
+def _traj(context: np.ndarray) -> Trajectory:
+    obs, action = context[:, :2], context[:, 2:4]
+    return Trajectory(obs, action, (obs + 0.1 * action).astype(np.float32), np.zeros(len(obs), dtype=np.float32))
 
 
 @pytest.mark.parametrize("k", [0.0, 1.0])
@@ -165,18 +162,30 @@ def test_relabelling_leaves_the_other_rows_alone_bit_for_bit() -> None:
         a, b = plain.sample(8, meta_batch_size=32), mixed.sample(8, meta_batch_size=32)
         same = ~b.relabelled
         assert same.any() and not same.all()
-        for name, x, y in zip(a._fields[:-1], a, b, strict=False):
-            assert (np.asarray(x)[same] == np.asarray(y)[same]).all(), name
+        assert (a.task_ids == b.task_ids).all()
+        for lengths in ("context_lengths", "lengths"):
+            columns = (
+                ["context"] if lengths == "context_lengths" else ["observations", "actions", "next_observations", "rewards"]
+            )
+            for name in columns:
+                x, y = (by_task(getattr(data, name), getattr(data, lengths)) for data in (a, b))
+                assert all(np.array_equal(x[i], y[i]) for i in np.flatnonzero(same)), name
 
 
 def test_context_and_rl_batch_come_from_one_episode_without_duplicates_in_the_context() -> None:
     buffer = filled(n_episodes=12, relabel_probability=1.0)
     data = buffer.sample(16, meta_batch_size=32, context_size=20)
-    context, rl = data.context.numpy(), np.concatenate([data.observations, data.actions, data.rewards[..., None]], axis=-1)
-    for row in range(32):
-        steps = {tuple(step) for step in context[row]}
-        assert len(steps) == 20
-        assert {tuple(step) for step in rl[row]} <= steps
+    rl = th.cat([data.observations, data.actions, data.rewards[:, None]], dim=1)
+    for context, batch in zip(by_task(data.context, data.context_lengths), by_task(rl, data.lengths), strict=True):
+        steps = {tuple(step) for step in context}
+        assert len(context) == len(steps) == 20
+        assert len(batch) == len({tuple(step) for step in batch}) == 16
+        assert {tuple(step) for step in batch} <= steps
+
+
+def test_a_batch_larger_than_an_episode_is_the_whole_episode_once() -> None:
+    data = filled(relabel_probability=1.0).sample(256, meta_batch_size=8, context_size=1024)
+    assert (data.lengths == 20).all() and (data.context_lengths == 20).all()
 
 
 def test_ablation_draws_the_rl_batch_from_the_whole_task() -> None:
@@ -192,7 +201,7 @@ def test_final_strategy_takes_the_last_state() -> None:
     # At the goal itself the reward is 1 - 0, and that place must be where an episode ended
     index = buffer.episodes.index()
     ends = {tuple(row) for row in buffer.episodes.rows[index.rows[index.episode_row[1:] - 1], 5:7]}
-    reached = _context_traj(data).next_observations[data.context[..., -1].numpy() == 1]
+    reached = _traj(data.context.numpy()).next_observations[data.context[:, -1].numpy() == 1]
     assert len(reached) >= 16 and {tuple(place) for place in reached} <= ends
 
 
@@ -202,8 +211,8 @@ def hindsight_places(strategy: str) -> np.ndarray:
     places = []
     for _ in range(20):
         data = buffer.sample(1, meta_batch_size=64, context_size=20)
-        row, step = np.nonzero(data.context[..., -1].numpy() == 1)  # at the goal itself the reward is 1 - 0
-        places.append(_context_traj(data).next_observations[row, step])
+        at_goal = data.context[:, -1].numpy() == 1  # at the goal itself the reward is 1 - 0
+        places.append(_traj(data.context.numpy()).next_observations[at_goal])
     return np.concatenate(places)
 
 
@@ -226,18 +235,21 @@ def test_choose_rare_chooses_inversely_to_the_count(counts: list[list[float]], s
 def test_unrewarded_rows_are_those_without_a_reward_of_their_task() -> None:
     buffer = filled(relabel_probability=0.5)
     data = buffer.sample(16, meta_batch_size=200)
-    np.testing.assert_array_equal(data.unrewarded, (data.rewards == 0).all(dim=1))
+    np.testing.assert_array_equal(data.unrewarded, [(r == 0).all() for r in by_task(data.rewards, data.lengths)])
     # A cost that no task has a part in hides nothing
     buffer.episodes.rows[:, [buffer._reward, buffer._task_free_reward]] -= 0.25
     costly = buffer.sample(16, meta_batch_size=200)
-    assert 0.2 < costly.unrewarded.mean() < 0.7 and (costly.rewards[costly.unrewarded] == -0.25).all()
+    assert 0.2 < costly.unrewarded.mean() < 0.7
+    rewards = by_task(costly.rewards, costly.lengths)
+    assert all((rewards[i] == -0.25).all() for i in np.flatnonzero(costly.unrewarded))
 
 
 def test_dense_proxy_is_only_in_the_rl_batch() -> None:
     sparse, dense = (filled(relabel_probability=0.0, rl_reward_type=t) for t in ("sparse", "dense"))
     a, b = sparse.sample(8), dense.sample(8)
     assert (a.context == b.context).all()
-    distance = np.linalg.norm(b.next_observations.numpy() - FAMILY.train_tasks[b.task_ids][:, None], axis=-1)
+    goals = FAMILY.train_tasks[b.task_ids].repeat(b.lengths.numpy(), axis=0)
+    distance = np.linalg.norm(b.next_observations.numpy() - goals, axis=-1)
     np.testing.assert_allclose(b.rewards, -distance, rtol=1e-5)
 
 

@@ -227,6 +227,16 @@ def test_export_is_small_exact_and_plain(run: Path, tmp_path: Path, tiny_pearl: 
     exported.learn(500)
 
 
+def test_a_model_of_another_version_is_said_to_be_one(tmp_path: Path, tiny_pearl: Callable[..., PEARL]) -> None:
+    tiny_pearl(policy_kwargs={"net_arch": [8], "encoder_arch": [16], "latent_dim": 3}).save(tmp_path / "other.zip")
+    with zipfile.ZipFile(SHIPPED) as shipped_file, zipfile.ZipFile(tmp_path / "other.zip") as other:
+        with zipfile.ZipFile(tmp_path / "mixed.zip", "w") as mixed:
+            for name in shipped_file.namelist():
+                mixed.writestr(name, (other if name == "policy.pth" else shipped_file).read(name))
+    with pytest.raises(ValueError, match=r"mixed.zip has other networks than this version makes \(it is of sb3_htr 0.1.0\)"):
+        main(["enjoy", str(tmp_path / "mixed.zip"), "--no-render"])
+
+
 def test_a_folder_to_share_says_how_to_use_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

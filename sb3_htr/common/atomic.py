@@ -23,7 +23,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         for file in temporary.rglob("*") if temporary.is_dir() else [temporary]:
             with open(file, "rb") as handle:
                 os.fsync(handle.fileno())
-        if path.is_dir():
+        # A folder replaces a folder; a file does not
+        if temporary.is_dir() and path.is_dir():
             shutil.rmtree(path)
         os.replace(temporary, path)
         # The new name must survive a power cut too

@@ -48,29 +48,31 @@ class TaskFamily(Protocol):
 
 class MultiTaskSamples(NamedTuple):
     """
-    One meta-batch of M tasks: C context transitions and B transitions for actor and critics per task.
+    One meta-batch of M tasks: n transitions for the context and N for actor and critics, those of the first task first.
 
-    All tensors are float32 on the buffer's device, unless said otherwise.
+    All tensors are on the buffer's device, and float32, unless said otherwise.
 
-    :param context: (M, C, obs_dim + action_dim + 1), rows (o, a, r)
-    :param context_mask: (M, C), 1 where a context row holds a transition, 0 where it is padding
-    :param observations: (M, B, obs_dim)
-    :param actions: (M, B, action_dim), scaled to [-1, 1]
-    :param next_observations: (M, B, obs_dim)
-    :param rewards: (M, B)
-    :param dones: (M, B), 1 where the episode terminated (time limits do not count)
+    :param context: (n, obs_dim + action_dim + 1), rows (o, a, r)
+    :param context_lengths: (M,) int64, how many rows of the context are of each task, at least 1
+    :param observations: (N, obs_dim)
+    :param actions: (N, action_dim), scaled to [-1, 1]
+    :param next_observations: (N, obs_dim)
+    :param rewards: (N,)
+    :param dones: (N,), 1 where the episode terminated (time limits do not count)
+    :param lengths: (M,) int64, how many of these transitions are of each task, at least 1
     :param task_ids: (M,) int array, the training task whose replay each row of the meta-batch came from
     :param relabelled: (M,) bool array, whether context and RL batch carry rewards of a hindsight task
     :param unrewarded: (M,) bool array, whether no reward of the RL batch has a part that depends on the task
     """
 
     context: th.Tensor
-    context_mask: th.Tensor
+    context_lengths: th.Tensor
     observations: th.Tensor
     actions: th.Tensor
     next_observations: th.Tensor
     rewards: th.Tensor
     dones: th.Tensor
+    lengths: th.Tensor
     task_ids: np.ndarray
     relabelled: np.ndarray
     unrewarded: np.ndarray

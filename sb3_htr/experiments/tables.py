@@ -1,13 +1,14 @@
 """Writes the result tables of the documents from ``results/*/summary.json``: ``python -m sb3_htr.experiments.tables``."""
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.experiments.report import RESULTS
 
-DOCUMENTS = (RESULTS.parent / "README.md", RESULTS.parent / "docs" / "results.md")
+DOCUMENTS = (RESULTS.parent / "README.md", RESULTS.parent / "docs" / "results.md", RESULTS.parent / "docs" / "performance.md")
 COLUMNS = {
     "last_episode_return": "return of the 20th episode",
     "success_rate": "tasks solved in it",
@@ -37,18 +38,28 @@ def table(summary: dict[str, Any]) -> str:
     )
 
 
-def main() -> None:
-    """Replace what stands between ``<!-- results:NAME -->`` and ``<!-- end -->``."""
-    for document in DOCUMENTS:
+def fill(documents: Iterable[Path], tables: dict[str, str]) -> None:
+    """
+    Replace what stands between ``<!-- NAME -->`` and ``<!-- end -->``.
+
+    :param documents: files to write
+    :param tables: what goes there, by name
+    """
+    for document in documents:
         text = document.read_text()
-        for path in sorted(Path(RESULTS).glob("*/summary.json")):
-            summary = json.loads(path.read_text())
-            start, end = f"<!-- results:{summary['name']} -->\n", "<!-- end -->"
+        for name, content in tables.items():
+            start, end = f"<!-- {name} -->\n", "<!-- end -->"
             if start in text:
                 before, _, after = text.partition(start)
-                text = before + start + table(summary) + end + after.partition(end)[2]
+                text = before + start + content + end + after.partition(end)[2]
         with atomic_path(document) as temporary:
             temporary.write_text(text)
+
+
+def main() -> None:
+    """All results that are there."""
+    summaries = [json.loads(path.read_text()) for path in sorted(Path(RESULTS).glob("*/summary.json"))]
+    fill(DOCUMENTS, {f"results:{summary['name']}": table(summary) for summary in summaries})
 
 
 if __name__ == "__main__":

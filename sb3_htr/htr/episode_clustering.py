@@ -169,17 +169,15 @@ class EpisodeClustering(MultiTaskReplayBuffer):
         if key not in self._buffer_of:
             self._buffer_of[key] = self.episodes.add_task()
             self._hindsight_tasks.append(hindsight_task)
-        relabelled = episode[None].copy()
-        self._write_rewards(relabelled, np.array([True]), slice(None), hindsight_task[None], "sparse")
-        self.episodes.add(self._buffer_of[key], relabelled[0])
+        relabelled = episode.copy()
+        tasks = np.broadcast_to(hindsight_task, (len(episode), len(hindsight_task)))
+        self._write_rewards(relabelled, np.arange(len(episode)), tasks, "sparse")
+        self.episodes.add(self._buffer_of[key], relabelled)
 
     def _draw_relabelled(self, meta_batch_size: int) -> np.ndarray:
         return super()._draw_relabelled(meta_batch_size) & (self.n_hindsight_buffers > 0)
 
-    def _draw_hindsight(
-        self, index: EpisodeIndex, tasks: np.ndarray, rl: np.ndarray, context_size: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def _draw_hindsight(self, index: EpisodeIndex, tasks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A random hindsight buffer in place of each real one."""
         chosen = self._relabel_rng.integers(self.n_hindsight_buffers, size=len(tasks))
-        draw = self._draw_task(self._relabel_rng, index, self.n_tasks + chosen, rl.shape[1], context_size)
-        return *draw, np.stack(self._hindsight_tasks)[chosen]
+        return self._task_sources(index, self.n_tasks + chosen), np.stack(self._hindsight_tasks)[chosen]

@@ -14,28 +14,36 @@ from sb3_htr.common.type_aliases import MultiTaskSamples, TaskFamily, Trajectory
 from sb3_htr.htr.episode_store import EpisodeIndex, EpisodeStore
 from sb3_htr.htr.hindsight_task import HindsightTaskStrategy, choose_rare, select_step, to_hindsight_task_strategy
 
+# Rows that candidates for hindsight tasks are compared with: enough to tell common from rare, in linear time
+MAX_COMPARED = 64
 
-def spread(rng: np.random.Generator, start: np.ndarray, length: np.ndarray, size: np.ndarray, width: int) -> np.ndarray:
+
+def spread(rng: np.random.Generator, ranges: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
     """
-    Draw integers of ranges, evenly spread: one from each of ``size`` parts of the range.
+    Draw up to ``width`` integers from each of several ranges, evenly spread: one from each of as many parts of the range.
 
-    Every integer has the same chance to be drawn, and none is drawn twice while ``size <= length``: a product of Gaussians
-    would count a duplicate in the context as evidence.
+    Every integer of a range has the same chance to be drawn, and none is drawn twice: a product of Gaussians would count a
+    duplicate in the context as evidence, and a loss that is a mean gains nothing from one.
 
     :param rng: source of randomness
-    :param start: (n,) int, first integer of each range
-    :param length: (n,) int, number of integers in each range
-    :param size: (n,) int, how many to draw from each range, at most ``width``
-    :param width: number of columns of the result
-    :return: (n, width) int; columns from ``size`` on hold any integer of the range
+    :param ranges: (n, 2) int, first and last + 1 of each range
+    :param width: how many to draw from each range; all of it, where it holds fewer
+    :return: the integers, one range after another, and (n,) int, how many of them are of each range
     """
-    n = len(start)
-    part = np.minimum(np.arange(width), size[:, None] - 1)
-    first, end = (edge * length[:, None] // size[:, None] for edge in (part, part + 1))
-    position = first + (rng.random((n, width)) * (end - first)).astype(np.int64)
+    length = ranges[:, 1] - ranges[:, 0]
+    size = np.minimum(length, width)
     # Parts differ in size by one, which a random rotation of the range makes up for
-    rotation = (rng.random(n) * length).astype(np.int64)
-    return start[:, None] + (position + rotation[:, None]) % length[:, None]
+    rotation = (rng.random(len(ranges)) * length).astype(np.int64)
+    # As many random numbers for each range, so that what is drawn from one does not depend on the others
+    uniform = rng.random((len(ranges), width))[np.arange(width) < size[:, None]]
+    n = np.repeat(size, size)
+    part = np.arange(len(n)) - np.repeat(np.cumsum(size) - size, size)
+    range_length = np.repeat(length, size)
+    first = part * range_length // n
+    end = (part + 1) * range_length // n
+    position = first + (uniform * (end - first)).astype(np.int64) + np.repeat(rotation, size)
+    position -= np.where(position >= range_length, range_length, 0)
+    return position + np.repeat(ranges[:, 0], size), size
 
 
 class MultiTaskReplayBuffer(ReplayBuffer):
@@ -307,11 +315,13 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         """
         Draw a meta-batch: tasks with replacement (as PEARL's reference does), and for each of them context and RL batch.
 
-        :param batch_size: transitions per task for actor and critics, B
+        No transition is drawn twice: where the episodes that a task's context or RL batch comes from hold fewer than asked
+        for, it is all of them. A loss that weighs tasks equally has the same expectation as with duplicates, for less work.
+
+        :param batch_size: transitions per task for actor and critics, at most
         :param env: normalizes observations, if given
         :param meta_batch_size: number of tasks, M
-        :param context_size: transitions per task for the context, C; where the episodes drawn from hold fewer, all of them
-            and padding
+        :param context_size: transitions per task for the context, at most
         :return: the meta-batch
         :raises ValueError: if no episode is complete yet, or the reward hook returns NaN or infinity
         """
@@ -320,52 +330,53 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         if len(collected) == 0:
             raise ValueError("The replay buffer holds no complete episode of any task: collect some before sampling.")
         tasks = collected[self._rng.integers(len(collected), size=meta_batch_size)]
-        context, context_length, rl = self._draw_task(self._rng, index, tasks, batch_size, context_size)
+        sources = self._task_sources(index, tasks)
         relabelled = self._draw_relabelled(meta_batch_size)
         reward_task = self.task_family.train_tasks[tasks]
         if relabelled.any():
-            draw = self._draw_hindsight(index, tasks[relabelled], rl[relabelled], context_size)
-            context[relabelled], context_length[relabelled], rl[relabelled], reward_task[relabelled] = draw
-        rows = self.episodes.rows[index.rows[np.concatenate([context, rl], axis=1)]]
+            sources[:, relabelled], reward_task[relabelled] = self._draw_hindsight(index, tasks[relabelled])
+        context, n_context = spread(self._rng, sources[0], context_size)
+        batch, n_batch = spread(self._rng, sources[1], batch_size)
+        rows = self.episodes.rows.take(index.rows.take(np.concatenate([context, batch])), axis=0)
+        task_of_row = np.concatenate([np.repeat(np.arange(meta_batch_size), n) for n in (n_context, n_batch)])
         if self.relabels_at_sample_time and relabelled.any():
-            self._write_rewards(rows, relabelled, slice(None), reward_task, "sparse")
+            where = np.flatnonzero(relabelled[task_of_row])
+            self._write_rewards(rows, where, reward_task[task_of_row[where]], "sparse")
         if self.rl_reward_type == "dense":
-            self._write_rewards(rows, np.full(meta_batch_size, True), slice(context_size, None), reward_task, "dense")
+            where = np.arange(len(context), len(rows))
+            self._write_rewards(rows, where, reward_task[task_of_row[where]], "dense")
         if env is not None:
             for column in (self._obs, self._next_obs):
-                rows[..., column] = env.normalize_obs(rows[..., column])
-        context_mask = (np.arange(context_size) < context_length[:, None]).astype(np.float32)
-        batch, mask = self.to_torch(rows, copy=False), self.to_torch(context_mask, copy=False)
+                rows[:, column] = env.normalize_obs(rows[:, column])
+        data = self.to_torch(rows, copy=False)
+        context_rows, rl_rows = data[: len(context)], data[len(context) :]
+        unrewarded = rows[len(context) :, self._reward] == rows[len(context) :, self._task_free_reward]
         return MultiTaskSamples(
-            context=batch[:, :context_size, : self.context_dim],
-            context_mask=mask,
-            observations=batch[:, context_size:, self._obs],
-            actions=batch[:, context_size:, self._action],
-            next_observations=batch[:, context_size:, self._next_obs],
-            rewards=batch[:, context_size:, self._reward],
-            dones=batch[:, context_size:, self._done],
+            context=context_rows[:, : self.context_dim],
+            context_lengths=self.to_torch(n_context, copy=False),
+            observations=rl_rows[:, self._obs],
+            actions=rl_rows[:, self._action],
+            next_observations=rl_rows[:, self._next_obs],
+            rewards=rl_rows[:, self._reward],
+            dones=rl_rows[:, self._done],
+            lengths=self.to_torch(n_batch, copy=False),
             task_ids=tasks,
             relabelled=relabelled,
-            unrewarded=(rows[:, context_size:, self._reward] == rows[:, context_size:, self._task_free_reward]).all(axis=1),
+            unrewarded=np.logical_and.reduceat(unrewarded, np.cumsum(n_batch) - n_batch),
         )
 
     def _draw_relabelled(self, meta_batch_size: int) -> np.ndarray:
         """(M,) bool, which rows of the meta-batch are relabelled."""
         return self._relabel_rng.random(meta_batch_size) < self.relabel_probability
 
-    def _draw_task(
-        self, rng: np.random.Generator, index: EpisodeIndex, tasks: np.ndarray, batch_size: int, context_size: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """As PEARL: RL batch from all of a task's replay, context from its latest episodes. Context, its length, RL batch."""
-        start, end = index.task_row[tasks], index.task_row[tasks + 1]
-        latest = np.maximum(index.task_episode[tasks + 1] - self.context_episodes, index.task_episode[tasks])
-        rl = spread(rng, start, end - start, np.full(len(tasks), batch_size), batch_size)
-        return *self._draw_context(rng, index.episode_row[latest], end, context_size), rl
+    def _task_sources(self, index: EpisodeIndex, tasks: np.ndarray) -> np.ndarray:
+        """As PEARL: where context and RL batch come from, the latest episodes and all of a task's replay. (2, M, 2) rows."""
+        first, end = index.task_episode[tasks], index.task_episode[tasks + 1]
+        latest = np.maximum(end - self.context_episodes, first)
+        return np.stack([index.episode_row[np.stack([start, end], axis=1)] for start in (latest, first)])
 
-    def _draw_hindsight(
-        self, index: EpisodeIndex, tasks: np.ndarray, rl: np.ndarray, context_size: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """SER: one episode and one hindsight task that it reached. Context, its length, RL batch, hindsight tasks."""
+    def _draw_hindsight(self, index: EpisodeIndex, tasks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """SER: one episode, the source of context and RL batch, and one hindsight task that it reached."""
         rng = self._relabel_rng
         first, end = index.task_episode[tasks, None], index.task_episode[tasks + 1, None]
         n_candidates = self.hindsight_task_strategy.n_candidates
@@ -375,30 +386,21 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         reached = self.trajectory(self.episodes.rows[index.rows[step]][..., None, :])
         hindsight_task = self.task_family.hindsight_task(reached, 0)
         chosen = np.arange(len(tasks)), choose_rare(self._count_alike(reached, hindsight_task), rng)
-        start, end = start[chosen], end[chosen]
-        context, context_length = self._draw_context(rng, start, end, context_size)
-        if self.rl_batch_source == "episode":
-            rl = spread(rng, start, end - start, np.full(len(tasks), rl.shape[1]), rl.shape[1])
-        return context, context_length, rl, hindsight_task[chosen]
+        source = np.stack([start[chosen], end[chosen]], axis=1)
+        rl_source = source if self.rl_batch_source == "episode" else self._task_sources(index, tasks)[1]
+        return np.stack([source, rl_source]), hindsight_task[chosen]
 
     def _count_alike(self, reached: Trajectory, task: np.ndarray) -> np.ndarray:
-        """(n, n_candidates), how many rows solve each candidate's task with their first candidate, plus 1."""
+        """(n, n_candidates), how many of some other rows solve each candidate's task with their first candidate, plus 1."""
         if task.shape[1] == 1:
             return np.ones(task.shape[:2])
-        first = Trajectory(*(values[:, 0] for values in reached))
+        first = Trajectory(*(values[:MAX_COMPARED, 0] for values in reached))
         return 1 + self.task_family.is_success(first, task[:, :, None])[..., 0].sum(axis=-1)
 
-    @staticmethod
-    def _draw_context(
-        rng: np.random.Generator, start: np.ndarray, end: np.ndarray, context_size: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        length = np.minimum(end - start, context_size)
-        return spread(rng, start, end - start, length, context_size), length
-
-    def _write_rewards(self, rows: np.ndarray, where: np.ndarray, steps: slice, task: np.ndarray, reward_type: str) -> None:
-        """Give ``rows[where, steps]`` the reward of ``task[where]``, in one call of the reward hook."""
-        traj = self.trajectory(rows[where, steps])
-        reward = self.task_family.compute_reward(traj, task[where], reward_type=reward_type)
+    def _write_rewards(self, rows: np.ndarray, where: np.ndarray, tasks: np.ndarray, reward_type: str) -> None:
+        """Give ``rows[where]`` the rewards of ``tasks``, one for each of them, in one call of the reward hook."""
+        traj = self.trajectory(rows.take(where, axis=0)[:, None])
+        reward = self.task_family.compute_reward(traj, tasks, reward_type=reward_type)[:, 0]
         if not np.isfinite(reward).all():
             raise ValueError("compute_reward returned NaN or infinity for a hindsight task, expected finite rewards.")
-        rows[where, steps, self._reward] = reward
+        rows[where, self._reward] = reward

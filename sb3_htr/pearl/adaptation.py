@@ -3,6 +3,7 @@
 import numpy as np
 import torch as th
 
+from sb3_htr.pearl.context import evenly_spread
 from sb3_htr.pearl.exploration import Explorer
 from sb3_htr.pearl.policies import PEARLPolicy
 from sb3_htr.pearl.task_search import TaskSearch
@@ -29,6 +30,8 @@ class Adaptation:
     :param n_envs: number of tasks
     :param explorer: how z is drawn before the posterior is used
     :param n_exploration_episodes: episodes before the posterior is used, for the explorer PRIOR
+    :param context_size: steps of an episode that the posterior is inferred from, evenly spread, at most: as many as in
+        meta-training, because each narrows it
     :param generator: source of randomness; torch's global one by default
     """
 
@@ -38,24 +41,29 @@ class Adaptation:
         n_envs: int,
         explorer: Explorer,
         n_exploration_episodes: int,
+        context_size: int,
         generator: th.Generator | None = None,
     ) -> None:
         self.policy = policy
         self.explorer = explorer
         self.n_exploration_episodes = n_exploration_episodes
+        self.context_size = context_size
         self.generator = generator
         self.n_episodes = np.zeros(n_envs, dtype=np.int64)
         # Return of the best episode, without the task-free part
         self.best_return = np.zeros(n_envs, dtype=np.float64)
         self.z = np.zeros((n_envs, policy.latent_dim), dtype=np.float32)
+        # Of the running episodes
         self._rows = np.zeros((n_envs, 64, policy.context_dim), dtype=np.float32)
         self._n_rows = np.zeros(n_envs, dtype=np.int64)
-        self._episode_start = np.zeros(n_envs, dtype=np.int64)
         self._episode_return = np.zeros(n_envs, dtype=np.float64)
         # Whether z has changed within the episode
         self._turned = np.zeros(n_envs, dtype=bool)
-        # Rows of the best episode, first and last + 1
-        self._best = np.zeros((n_envs, 2), dtype=np.int64)
+        # The posterior, as precision and precision times mean, which products of Gaussians add up. Meta-training sees contexts
+        # of one rewarded episode; the misses of a search would look like nothing it knows. So it is over the best episode,
+        # or, for the explorer PRIOR, over all of them
+        self._precision = np.zeros_like(self.z)
+        self._precision_mean = np.zeros_like(self.z)
         self._best_z = np.zeros_like(self.z)
         # Episodes since the best one
         self._setbacks = np.zeros(n_envs, dtype=np.int64)
@@ -91,13 +99,13 @@ class Adaptation:
         returns = np.where(self._turned, np.minimum(self._episode_return, FOUND), self._episode_return)
         better = ended[returns[ended] > self.best_return[ended] + 0.5 * ROUNDING]
         self.best_return[better] = returns[better]
-        self._best[better] = np.stack([self._episode_start, self._n_rows], axis=1)[better]
         self._best_z[better] = self.z[better]
         self._setbacks[ended] += 1
         self._setbacks[better] = 0
         self._episode_return[ended] = 0
         self._turned[ended] = False
-        self._episode_start[ended] = self._n_rows[ended]
+        self._infer(ended if self.explorer is Explorer.PRIOR else better)
+        self._n_rows[ended] = 0
         self.n_episodes[ended] += 1
         self._draw(ended)
 
@@ -152,22 +160,28 @@ class Adaptation:
             visit = exploring | ((self._setbacks[envs] % 2 == 0) & ~settled)
             self.z[envs[visit]] = self._search.begin(envs[visit], exploring[visit])
 
+    def _infer(self, envs: np.ndarray) -> None:
+        """Take the episodes that end into the posterior."""
+        if len(envs) == 0:
+            return
+        steps, lengths = evenly_spread(self._n_rows[envs], self.context_size)
+        rows = self._rows[np.repeat(envs, lengths), steps]
+        device = self.policy.device
+        with th.no_grad():
+            mean, variance = self.policy.encoder(th.as_tensor(rows, device=device), th.as_tensor(lengths, device=device))
+        if self.explorer is not Explorer.PRIOR:
+            self._precision[envs] = self._precision_mean[envs] = 0
+        self._precision[envs] += (1 / variance).cpu().numpy()
+        self._precision_mean[envs] += (mean / variance).cpu().numpy()
+
     def _sample_posterior(self, envs: np.ndarray) -> np.ndarray:
         mean, deviation = self._posterior(envs)
         if self.explorer is not Explorer.PRIOR:
             deviation *= 1 + self._setbacks[envs, None]
-        return mean + deviation * th.randn(mean.shape, generator=self.generator).numpy()
+        noise = th.randn(deviation.shape, generator=self.generator).numpy()
+        return np.asarray(mean + deviation * noise)
 
     def _posterior(self, envs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and standard deviation (k, latent_dim) for some envs."""
-        row = np.arange(self._n_rows[envs].max())
-        if self.explorer is Explorer.PRIOR:
-            mask = row < self._n_rows[envs, None]
-        else:
-            # Meta-training sees contexts of one rewarded episode; the misses of a search would look like nothing it knows
-            mask = (row >= self._best[envs, :1]) & (row < self._best[envs, 1:])
-        device = self.policy.device
-        with th.no_grad():
-            context = th.as_tensor(self._rows[envs, : len(row)], device=device)
-            mean, variance = self.policy.encoder(context, th.as_tensor(mask, dtype=th.float32, device=device))
-        return mean.cpu().numpy(), variance.sqrt().cpu().numpy()
+        """Mean and standard deviation (k, latent_dim) for some envs, those of N(0, 1) where there is no evidence yet."""
+        variance = 1 / np.where(self._precision[envs] > 0, self._precision[envs], 1)
+        return variance * self._precision_mean[envs], np.sqrt(variance)

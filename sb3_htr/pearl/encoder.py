@@ -5,24 +5,30 @@ from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_htr.common.linear import with_fast_linear
+
 # Smallest variance of a factor, as in PEARL's reference implementation
 MIN_VARIANCE = 1e-7
 
 
-def product_of_gaussians(mean: th.Tensor, variance: th.Tensor, weight: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+def product_of_gaussians(mean: th.Tensor, variance: th.Tensor, lengths: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     """
-    Product of the Gaussian factors along the next to last axis.
+    Products of Gaussian factors, of several groups at once.
 
-    :param mean: (..., C, latent_dim)
-    :param variance: (..., C, latent_dim), positive
-    :param weight: (..., C), how often each factor counts; 0 leaves it out
-    :return: mean and variance (..., latent_dim); those of N(0, 1) where all weights are 0
+    :param mean: (n, latent_dim), those of the first group first
+    :param variance: (n, latent_dim), positive
+    :param lengths: (M,) int64, number of factors of each group
+    :return: mean and variance (M, latent_dim); those of N(0, 1) where a group has no factors
     """
-    precision = weight.unsqueeze(-1) / variance
-    total = precision.sum(dim=-2)
+    precision = 1.0 / variance
+    total = _sum_groups(precision, lengths)
     empty = total == 0
     posterior_variance = 1.0 / total.masked_fill(empty, 1.0)
-    return posterior_variance * (precision * mean).sum(dim=-2), posterior_variance
+    return posterior_variance * _sum_groups(precision * mean, lengths), posterior_variance
+
+
+def _sum_groups(values: th.Tensor, lengths: th.Tensor) -> th.Tensor:
+    return th.segment_reduce(values, "sum", lengths=lengths, axis=0, unsafe=True)
 
 
 def kl_to_prior(mean: th.Tensor, variance: th.Tensor) -> th.Tensor:
@@ -51,13 +57,13 @@ class ContextEncoder(nn.Module):
     ) -> None:
         super().__init__()
         self.latent_dim = latent_dim
-        self.factors = nn.Sequential(*create_mlp(context_dim, 2 * latent_dim, net_arch, activation_fn))
+        self.factors = with_fast_linear(nn.Sequential(*create_mlp(context_dim, 2 * latent_dim, net_arch, activation_fn)))
 
-    def forward(self, context: th.Tensor, mask: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def forward(self, context: th.Tensor, lengths: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
-        :param context: (..., C, context_dim)
-        :param mask: (..., C), 1 for rows that count
-        :return: mean and variance of the posterior, (..., latent_dim) each
+        :param context: (n, context_dim), the contexts of several tasks, one after another
+        :param lengths: (M,) int64, number of rows of each
+        :return: mean and variance of the posteriors, (M, latent_dim) each
         """
         mean, raw = self.factors(context).chunk(2, dim=-1)
-        return product_of_gaussians(mean, F.softplus(raw).clamp(min=MIN_VARIANCE), mask)
+        return product_of_gaussians(mean, F.softplus(raw).clamp(min=MIN_VARIANCE), lengths)

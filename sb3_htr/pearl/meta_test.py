@@ -22,6 +22,7 @@ class AdaptsAtMetaTest(SAC):
     policy: PEARLPolicy
     explorer: str
     n_exploration_episodes: int
+    context_size: int
     _warned_not_adapted: bool
 
     def start_adaptation(
@@ -40,7 +41,8 @@ class AdaptsAtMetaTest(SAC):
         """
         if n_exploration_episodes is None:
             n_exploration_episodes = self.n_exploration_episodes
-        return Adaptation(self.policy, n_envs, to_explorer(explorer or self.explorer), n_exploration_episodes, generator)
+        chosen = to_explorer(explorer or self.explorer)
+        return Adaptation(self.policy, n_envs, chosen, n_exploration_episodes, self.context_size, generator)
 
     def adapt(
         self,

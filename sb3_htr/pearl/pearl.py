@@ -12,6 +12,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Rollout
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.common import checks
+from sb3_htr.common.matmul import PRECISIONS, matmul_precision
 from sb3_htr.common.type_aliases import TaskFamily
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
@@ -45,7 +46,7 @@ class PEARL(AdaptsAtMetaTest, SavesToFiles):
     :param learning_rate: of all networks, may be a function of the remaining progress (paper: 3e-4)
     :param buffer_size: capacity in transitions, shared equally by the training tasks
     :param learning_starts: env steps with random actions before learning starts
-    :param batch_size: transitions per task for actor and critics (PEARL's reference: 256)
+    :param batch_size: transitions per task for actor and critics, fewer where fewer are at hand (PEARL's reference: 256)
     :param tau: soft update of the target critics, in (0, 1] (PEARL's reference: 0.005)
     :param gamma: discount (PEARL's reference for the sparse point robot: 0.9)
     :param gradient_steps: updates after each rollout (PEARL's reference: 1000)
@@ -55,7 +56,8 @@ class PEARL(AdaptsAtMetaTest, SavesToFiles):
     :param target_update_interval: updates between soft updates of the target critics
     :param target_entropy: for ``ent_coef="auto"``
     :param meta_batch_size: tasks per update (paper: 16)
-    :param context_size: transitions per task for the context; more than an episode has is padding under relabelling
+    :param context_size: transitions per task for the context, fewer where fewer are at hand: under relabelling, at most an
+        episode (PEARL's reference: 1024)
     :param kl_coef: weight of the KL divergence of the posterior from N(0, I), summed over z's dimensions and averaged over
         tasks, beside the critics' squared errors averaged over transitions (PEARL's reference, in these units: 0.0016)
     :param n_tasks_per_rollout: training tasks per rollout (PEARL's reference: 10)
@@ -63,6 +65,8 @@ class PEARL(AdaptsAtMetaTest, SavesToFiles):
     :param n_exploration_episodes: episodes before the posterior is used, for the explorer ``"prior"``
     :param explorer: how z is drawn before the posterior is used at meta-test, see :class:`Explorer`
     :param train_explorer: the same for rollouts
+    :param matmul_precision: of matrix products in updates, as for ``torch.set_float32_matmul_precision``. ``"medium"`` rounds
+        their factors to bfloat16, which on hardware that has it takes half the time
     :param stats_window_size: episodes over which logged returns are averaged
     :param tensorboard_log: folder for TensorBoard, none by default
     :param policy_kwargs: arguments of the policy: ``latent_dim``, ``net_arch``, ``encoder_arch`` (paper: 5, 3x300, 3x200)
@@ -103,6 +107,7 @@ class PEARL(AdaptsAtMetaTest, SavesToFiles):
         n_exploration_episodes: int = 5,
         explorer: str = "search",
         train_explorer: str = "aggregate",
+        matmul_precision: str = "highest",
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -126,6 +131,8 @@ class PEARL(AdaptsAtMetaTest, SavesToFiles):
             gamma=(gamma, 0.0, 1.0),
             tau=(tau, 0.0, 1.0),
         )
+        if matmul_precision not in PRECISIONS:
+            raise ValueError(f"matmul_precision is {matmul_precision!r}, expected one of {list(PRECISIONS)}.")
         buffer_class = replay_buffer_class or MultiTaskReplayBuffer
         checks.check_keywords("replay_buffer_kwargs", replay_buffer_kwargs or {}, buffer_class)
         if isinstance(env, str):
@@ -166,6 +173,7 @@ class PEARL(AdaptsAtMetaTest, SavesToFiles):
         self.n_exploration_episodes = n_exploration_episodes
         self.explorer = to_explorer(explorer).value
         self.train_explorer = to_explorer(train_explorer).value
+        self.matmul_precision = matmul_precision
         self.task_bank: TaskBank | None = None
         # Training tasks in the order of the coming rollouts: every task once, then every task once in another order
         self._task_queue = np.zeros(0, dtype=np.int64)
@@ -310,12 +318,8 @@ class PEARL(AdaptsAtMetaTest, SavesToFiles):
         if self.ent_coef_optimizer is not None:
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
-        try:
+        with matmul_precision(self.matmul_precision):
             means, logs = zip(*(self._update(batch_size) for _ in range(gradient_steps)), strict=True)
-        except ValueError:
-            # torch's distributions refuse what is not finite, in many lines
-            check_finite(self.policy, {}, self._n_updates, self.num_timesteps)
-            raise
         log_means = {key: th.stack([log[key] for log in logs]).mean().item() for key in logs[0]}
         check_finite(self.policy, log_means, self._n_updates, self.num_timesteps)
         self._posterior_watch.check(log_means["kl_divergence"])
@@ -335,20 +339,22 @@ class PEARL(AdaptsAtMetaTest, SavesToFiles):
             meta_batch_size=self.meta_batch_size,
             context_size=self.context_size,
         )
+        # Each task has the same weight in a mean over transitions
+        weight = (1.0 / (self.meta_batch_size * data.lengths)).repeat_interleave(data.lengths, output_size=len(data.rewards))
         # One backward pass through the encoder: it learns from the critics' errors and the KL term
-        mean, variance = self.encoder(data.context, data.context_mask)
+        mean, variance = self.encoder(data.context, data.context_lengths)
         z = mean + variance.sqrt() * th.randn_like(mean)
         kl = kl_to_prior(mean, variance).mean()
-        z_rows = z.unsqueeze(1).expand(-1, batch_size, -1)
-        obs_z = th.cat([data.observations, z_rows], dim=-1).flatten(0, 1)
+        z_rows = z.repeat_interleave(data.lengths, dim=0, output_size=len(data.rewards))
+        obs_z = th.cat([data.observations, z_rows], dim=1)
         ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp()
         with th.no_grad():
-            next_obs_z = th.cat([data.next_observations, z_rows], dim=-1).flatten(0, 1)
-            next_actions, next_log_prob = self.actor.action_log_prob(next_obs_z)
+            next_obs_z = th.cat([data.next_observations, z_rows], dim=1)
+            next_actions, next_log_prob = self.policy.sample_actions(next_obs_z)
             next_q = self.critic_target(next_obs_z, next_actions).amin(dim=0) - ent_coef * next_log_prob
-            target_q = data.rewards.flatten() + (1 - data.dones.flatten()) * self.gamma * next_q
-        q = self.critic(obs_z, data.actions.flatten(0, 1))
-        critic_loss = (q - target_q).square().sum(dim=0).mean()
+            target_q = data.rewards + (1 - data.dones) * self.gamma * next_q
+        q = self.critic(obs_z, data.actions)
+        critic_loss = ((q - target_q).square() * weight).sum()
         self.critic.optimizer.zero_grad()
         self.encoder.optimizer.zero_grad()
         (critic_loss + self.kl_coef * kl).backward()
@@ -357,16 +363,15 @@ class PEARL(AdaptsAtMetaTest, SavesToFiles):
 
         # The actor sees z, but does not shape it
         obs_z = obs_z.detach()
-        actions_pi, log_prob = self.actor.action_log_prob(obs_z)
-        self.critic.requires_grad_(False)
-        actor_loss = (ent_coef * log_prob - self.critic(obs_z, actions_pi).amin(dim=0)).mean()
+        actions_pi, log_prob = self.policy.sample_actions(obs_z)
+        actor_loss = ((ent_coef * log_prob - self.critic(obs_z, actions_pi).amin(dim=0)) * weight).sum()
         self.actor.optimizer.zero_grad()
-        actor_loss.backward()
+        # The critics' weights get no gradient, and none is computed
+        actor_loss.backward(inputs=list(self.actor.parameters()))
         self.actor.optimizer.step()
-        self.critic.requires_grad_(True)
 
         if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
-            ent_coef_loss = -(self.log_ent_coef * (log_prob.detach().mean() + float(self.target_entropy))).mean()
+            ent_coef_loss = -(self.log_ent_coef * ((log_prob.detach() * weight).sum() + float(self.target_entropy))).mean()
             self.ent_coef_optimizer.zero_grad()
             ent_coef_loss.backward()
             self.ent_coef_optimizer.step()
@@ -374,17 +379,16 @@ class PEARL(AdaptsAtMetaTest, SavesToFiles):
         if self._n_updates % self.target_update_interval == 0:
             with th.no_grad():
                 th._foreach_lerp_(list(self.critic_target.parameters()), list(self.critic.parameters()), self.tau)
-        relabelled = th.as_tensor(data.relabelled, device=self.device)
         log = {
             "critic_loss": critic_loss.detach(),
             "actor_loss": actor_loss.detach(),
             "kl_divergence": kl.detach(),
             "ent_coef": ent_coef.detach().mean(),
             "posterior_std": variance.detach().sqrt().mean(),
-            "q_value": q.detach().mean(),
-            "relabelled_fraction": relabelled.float().mean(),
-            "rl_reward_mean": data.rewards.mean(),
-            "rl_zero_reward_fraction": th.as_tensor(data.unrewarded, device=self.device).float().mean(),
+            "q_value": (q.detach().mean(dim=0) * weight).sum(),
+            "relabelled_fraction": th.tensor(data.relabelled.mean()),
+            "rl_reward_mean": (data.rewards * weight).sum(),
+            "rl_zero_reward_fraction": th.tensor(data.unrewarded.mean()),
         }
         return mean.detach(), log
 
@@ -395,13 +399,13 @@ class PEARL(AdaptsAtMetaTest, SavesToFiles):
         n_solved = min(len(self.task_bank.solved), prior.max_known_tasks)
         # A loaded model's known tasks are kept until this training knows as many
         if n_solved >= max(int(prior.n_known_tasks), 1):
-            best = self.task_bank.best_episodes(self.replay_buffer, prior.max_known_tasks)
-            context, mask, returns, first_success = best
+            best = self.task_bank.best_episodes(self.replay_buffer, prior.max_known_tasks, self.context_size)
+            context, lengths, returns, first_success = best
             if self._vec_normalize_env is not None:
                 obs = slice(0, self.replay_buffer.obs_dim)
-                context[..., obs] = self._vec_normalize_env.normalize_obs(context[..., obs])
+                context[:, obs] = self._vec_normalize_env.normalize_obs(context[:, obs])
             with th.no_grad():
-                z, _ = self.encoder(th.as_tensor(context, device=self.device), th.as_tensor(mask, device=self.device))
+                z, _ = self.encoder(th.as_tensor(context, device=self.device), th.as_tensor(lengths, device=self.device))
             prior.set_known_tasks(KnownTasks(z.cpu().numpy(), returns, first_success))
 
     def _excluded_save_params(self) -> list[str]:

@@ -8,38 +8,21 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BaseModel
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
-from stable_baselines3.sac.policies import SACPolicy
+from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, SACPolicy
 from torch import nn
-from torch.nn import functional as F
 
+from sb3_htr.common.linear import Linear, with_fast_linear
 from sb3_htr.pearl.encoder import ContextEncoder
 from sb3_htr.pearl.exploration import LatentPrior
-
-
-class EnsembleLinear(nn.Module):
-    """
-    ``n_members`` linear layers evaluated in one batched product.
-
-    :param n_members: number of independent layers
-    :param in_features: input units
-    :param out_features: output units
-    """
-
-    def __init__(self, n_members: int, in_features: int, out_features: int) -> None:
-        super().__init__()
-        # The distribution that nn.Linear starts from
-        bound = 1 / math.sqrt(in_features)
-        self.weight = nn.Parameter(th.empty(n_members, in_features, out_features).uniform_(-bound, bound))
-        self.bias = nn.Parameter(th.empty(n_members, 1, out_features).uniform_(-bound, bound))
-
-    def forward(self, x: th.Tensor) -> th.Tensor:
-        return th.baddbmm(self.bias, x, self.weight)
 
 
 class LatentCritic(BaseModel):
     """
     Ensemble of Q(o, a, z) networks with layer normalization, which keeps the bootstrapped targets of unseen z bounded.
+
+    One network after the other: a batched product of all of them is no faster than its parts, and keeps out of oneDNN.
 
     :param observation_space: space of (o, z)
     :param action_space: Box
@@ -59,11 +42,12 @@ class LatentCritic(BaseModel):
         super().__init__(observation_space, action_space)
         self.n_critics = n_critics
         units = [observation_space.shape[0] + action_space.shape[0], *net_arch]
-        self.layers = nn.ModuleList(EnsembleLinear(n_critics, i, o) for i, o in pairwise(units))
-        self.scales = nn.ParameterList(th.ones(n_critics, 1, o) for o in net_arch)
-        self.shifts = nn.ParameterList(th.zeros(n_critics, 1, o) for o in net_arch)
-        self.output = EnsembleLinear(n_critics, units[-1], 1)
-        self.activation = activation_fn()
+
+        def network() -> nn.Sequential:
+            hidden = [(Linear(i, o), nn.LayerNorm(o), activation_fn()) for i, o in pairwise(units)]
+            return nn.Sequential(*(module for layer in hidden for module in layer), Linear(units[-1], 1))
+
+        self.networks = nn.ModuleList(network() for _ in range(n_critics))
 
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
@@ -71,11 +55,8 @@ class LatentCritic(BaseModel):
         :param actions: (n, action_dim), scaled to [-1, 1]
         :return: (n_critics, n)
         """
-        x = th.cat([obs, actions], dim=1).expand(self.n_critics, -1, -1)
-        for layer, scale, shift in zip(self.layers, self.scales, self.shifts, strict=True):
-            x = layer(x)
-            x = self.activation(F.layer_norm(x, x.shape[-1:]) * scale + shift)
-        return self.output(x).squeeze(-1)
+        x = th.cat([obs, actions], dim=1)
+        return th.cat([network(x) for network in self.networks], dim=1).T
 
 
 class PEARLPolicy(SACPolicy):
@@ -91,7 +72,7 @@ class PEARLPolicy(SACPolicy):
     :param activation_fn: activation of all networks
     :param n_critics: number of critics
     :param optimizer_class: optimizer of all networks
-    :param optimizer_kwargs: its arguments, without the learning rate
+    :param optimizer_kwargs: its arguments, without the learning rate; Adam is fused unless told otherwise
     """
 
     def __init__(
@@ -109,6 +90,8 @@ class PEARLPolicy(SACPolicy):
     ) -> None:
         if latent_dim < 1:
             raise ValueError(f"latent_dim is {latent_dim}, expected at least 1.")
+        if optimizer_class is th.optim.Adam:
+            optimizer_kwargs = {"fused": True, **(optimizer_kwargs or {})}
         self.latent_dim = latent_dim
         self.encoder_arch = [128, 128] if encoder_arch is None else encoder_arch
         obs_dim = int(np.prod(observation_space.shape))
@@ -126,7 +109,13 @@ class PEARLPolicy(SACPolicy):
         )
         self.observation_space = observation_space
 
+    @property
+    def device(self) -> th.device:
+        """Where the networks are. SB3 looks for it among all parameters, which takes longer than to act."""
+        return self.latent_prior.mean.device
+
     def _build(self, lr_schedule: Schedule) -> None:
+        self.latent_prior = LatentPrior(self.latent_dim)
         super()._build(lr_schedule)
         self.encoder = ContextEncoder(self.context_dim, self.latent_dim, self.encoder_arch, self.activation_fn)
         self.encoder.optimizer = self.optimizer_class(
@@ -134,10 +123,14 @@ class PEARLPolicy(SACPolicy):
             lr=lr_schedule(1),  # type: ignore[call-arg]
             **self.optimizer_kwargs,
         )
-        self.latent_prior = LatentPrior(self.latent_dim)
         # z of predict() calls without a state: the prior mean
         self._z = th.zeros(1, self.latent_dim)
         self.critic_target.requires_grad_(False)
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
+        actor = super().make_actor(features_extractor)
+        with_fast_linear(actor)
+        return actor
 
     def make_critic(self, features_extractor: nn.Module | None = None) -> LatentCritic:  # type: ignore[override]
         kwargs: dict[str, Any] = self.critic_kwargs
@@ -182,11 +175,49 @@ class PEARLPolicy(SACPolicy):
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         assert isinstance(observation, th.Tensor)
         obs = observation.flatten(1).float()
-        return self.actor(th.cat([obs, self._z.expand(len(obs), -1)], dim=1), deterministic)
+        return self._act(th.cat([obs, self._z.expand(len(obs), -1)], dim=1), deterministic)
+
+    def act(self, obs: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """
+        What :meth:`predict` does, without its checks and conversions, which take longer: for every step of a rollout.
+
+        :param obs: (n, obs_dim) float32
+        :param z: (n, latent_dim) float32
+        :return: (n, action_dim), sampled actions scaled to [-1, 1]
+        """
+        with th.no_grad():
+            obs_z = th.as_tensor(np.concatenate([obs.reshape(len(obs), -1), z], axis=1), device=self.device)
+            return self._act(obs_z, deterministic=False).cpu().numpy()
+
+    def _act(self, obs_z: th.Tensor, deterministic: bool) -> th.Tensor:
+        mean, log_std = self._gaussian(obs_z)
+        return th.tanh(mean if deterministic else mean + log_std.exp() * th.randn_like(mean))
+
+    def sample_actions(self, obs_z: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        The actor's ``action_log_prob`` without torch's distributions, whose checks take longer than the sampling.
+
+        :param obs_z: (n, obs_dim + latent_dim)
+        :return: actions (n, action_dim) in (-1, 1), and the logarithm of their density (n,), both differentiable
+        """
+        mean, log_std = self._gaussian(obs_z)
+        noise = th.randn_like(mean)
+        actions = th.tanh(mean + log_std.exp() * noise)
+        log_prob = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
+        # The density of tanh(x); SB3's epsilon
+        return actions, (log_prob - th.log(1.0 - actions.square() + 1e-6)).sum(dim=1)
+
+    def _gaussian(self, obs_z: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Mean and log standard deviation of the actions before tanh."""
+        hidden = self.actor.latent_pi(obs_z)
+        log_std = self.actor.log_std(hidden).clamp(LOG_STD_MIN, LOG_STD_MAX)  # type: ignore[operator]
+        return self.actor.mu(hidden), log_std
 
     def set_training_mode(self, mode: bool) -> None:
-        super().set_training_mode(mode)
-        self.encoder.train(mode)
+        # predict() asks for it at every step, and telling all modules takes longer than the actor does
+        if any(module.training != mode for module in (self, self.actor, self.critic, self.encoder)):
+            super().set_training_mode(mode)
+            self.encoder.train(mode)
 
 
 MlpPolicy = PEARLPolicy

@@ -95,6 +95,6 @@ def _choose_actions(
     """Actions for the envs, and the same scaled to [-1, 1]."""
     if model.num_timesteps < learning_starts:
         scaled = model._rng.uniform(-1, 1, (len(obs), *model.action_space.shape)).astype(np.float32)  # type: ignore[misc]
-        return model.policy.unscale_action(scaled), scaled
-    actions, _ = model.policy.predict(obs, (adaptation.z,))
-    return actions, model.policy.scale_action(actions)
+    else:
+        scaled = model.policy.act(obs.astype(np.float32, copy=False), adaptation.z)
+    return model.policy.unscale_action(scaled), scaled

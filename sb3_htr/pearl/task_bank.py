@@ -7,6 +7,7 @@ import torch as th
 
 from sb3_htr.common.type_aliases import TaskFamily
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
+from sb3_htr.pearl.context import evenly_spread
 
 # Episodes rewarded under all training tasks at a time, to bound memory
 CHUNK = 256
@@ -69,15 +70,18 @@ class TaskBank:
         """(n_solved,) int, the training tasks that some episode would have solved."""
         return np.flatnonzero(self.length)
 
-    def best_episodes(self, buffer: MultiTaskReplayBuffer, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def best_episodes(
+        self, buffer: MultiTaskReplayBuffer, size: int, context_size: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """
         What an unknown task may be like: the solved training tasks, each with its best episode.
 
         :param buffer: names the columns of the episodes
         :param size: largest number of tasks; of more, evenly spread ones are taken
-        :return: contexts (n, T, obs_dim + action_dim + 1), rows (o, a, r); their mask (n, T); and of episode i under task j
-            the return without the task-free part (n, n) and the number of steps before the first success (n, n), infinite
-            without one
+        :param context_size: steps of an episode that become its context, evenly spread, at most
+        :return: contexts (n_rows, obs_dim + action_dim + 1), rows (o, a, r) of all episodes; how many are of each (n,); and of
+            episode i under task j the return without the task-free part (n, n) and the number of steps before the first
+            success (n, n), infinite without one
         """
         solved = self.solved
         solved = solved[np.linspace(0, len(solved) - 1, min(size, len(solved))).round().astype(np.int64)]
@@ -85,9 +89,11 @@ class TaskBank:
         valid = np.arange(episodes.shape[1]) < self.length[solved, None]
         context = episodes[..., : buffer.context_dim].copy()
         context[..., -1] = self.task_family.compute_reward(buffer.trajectory(episodes), tasks)
+        steps, lengths = evenly_spread(self.length[solved], context_size)
+        context = context[np.repeat(np.arange(len(solved)), lengths), steps]
         success, returns = self._outcome(buffer, episodes, valid, tasks)
         first_success = np.where(success.any(axis=-1), success.argmax(axis=-1), np.inf)
-        return context, valid.astype(np.float32), returns, first_success.astype(np.float32)
+        return context, lengths, returns, first_success.astype(np.float32)
 
     def _outcome(
         self, buffer: MultiTaskReplayBuffer, episodes: np.ndarray, valid: np.ndarray, tasks: np.ndarray

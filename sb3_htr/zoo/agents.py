@@ -51,8 +51,16 @@ class TrainedAgent:
         """
         :param device: torch device
         :return: the model
+        :raises ValueError: for a model whose networks are not those of this version
         """
-        return PEARL.load(self.path, device=device)
+        try:
+            return PEARL.load(self.path, device=device)
+        except RuntimeError as error:
+            writer = self.record.get("versions", {}).get("sb3_htr", "unknown")
+            reason = str(error).splitlines()[-1].strip()[:200]
+            raise ValueError(
+                f"{self.path} has other networks than this version makes (it is of sb3_htr {writer}): {reason}"
+            ) from None
 
     def make_env(self, render_mode: str | None = None) -> gym.Env:
         """

@@ -71,6 +71,10 @@ def console() -> int:
     """
     try:
         return main()
+    except BrokenPipeError:
+        # Whoever reads the output, as `head` does, has seen enough; nothing more can be written at the end either
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except MISTAKES as error:
         if os.environ.get("SB3_HTR_TRACEBACK"):
             raise

@@ -31,6 +31,7 @@ from sb3_htr import PEARL
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.callbacks import MetaEvalCallback, MetaTrialEvalCallback, ProgressCallback
 from sb3_htr.common.checks import check_keywords
+from sb3_htr.common.memory import keep_freed_memory
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.pearl.resume import CheckpointCallback, checkpoints, cut_monitor_files, load_latest
@@ -284,6 +285,7 @@ def main(argv: Sequence[str]) -> None:
     register()
     if {"-h", "--help"} & set(argv):
         print(HELP)
+    keep_freed_memory()
     arguments, run = _arguments(argv)
     before, sys.argv = sys.argv, ["sb3-htr train", *arguments]
     MetaExperimentManager.resumed = run

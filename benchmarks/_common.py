@@ -1,0 +1,136 @@
+"""What the benchmarks share: timing two things side by side, models of the paper's sizes, and the files that they write."""
+
+import json
+import platform
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+
+import htr_envs  # noqa: F401 registers the envs
+from sb3_htr import PEARL
+from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.memory import keep_freed_memory
+from sb3_htr.common.vec_env import make_task_vec_env
+
+# As sb3-htr train does
+keep_freed_memory()
+
+ENV_ID = "SparsePointRobot-v0"
+RESULTS = Path(__file__).parent / "results"
+# HTR paper, A.2, and PEARL's reference implementation
+PAPER_SIZES: dict[str, Any] = {
+    "meta_batch_size": 16,
+    "batch_size": 256,
+    "context_size": 1024,
+    "policy_kwargs": {"net_arch": [300] * 3, "encoder_arch": [200] * 3, "latent_dim": 5},
+}
+
+
+@dataclass
+class Figure:
+    """
+    One line of a benchmark.
+
+    :param name: what is measured
+    :param unit: of ours and of the reference
+    :param ours: median over the rounds
+    :param reference: the same of the alternative, None where there is none
+    :param ratio: how many times better ours is, the median of the rounds' ratios
+    :param goal: smallest ratio that was asked for, None where none was
+    :param against: the alternative
+    """
+
+    name: str
+    unit: str
+    ours: float
+    reference: float | None = None
+    ratio: float | None = None
+    goal: float | None = None
+    against: str = ""
+
+
+def seconds(function: Callable[[], Any], n: int) -> float:
+    """
+    :param function: what is timed
+    :param n: number of calls
+    :return: mean duration of a call
+    """
+    start = time.perf_counter()
+    for _ in range(n):
+        function()
+    return (time.perf_counter() - start) / n
+
+
+def by_turns(durations: dict[str, Callable[[], float]], rounds: int = 9) -> dict[str, np.ndarray]:
+    """
+    Time several things by turns, so that what else the machine does meets all of them.
+
+    :param durations: each measures itself once
+    :param rounds: how often
+    :return: (rounds,) durations of each
+    """
+    for duration in durations.values():
+        duration()
+    times = [[duration() for duration in durations.values()] for _ in range(rounds)]
+    return dict(zip(durations, np.array(times).T, strict=True))
+
+
+def faster(ours: np.ndarray, reference: np.ndarray) -> float:
+    """
+    :param ours: (rounds,) durations
+    :param reference: (rounds,) durations
+    :return: median ratio
+    """
+    return statistics.median(reference / ours)
+
+
+def make_model(n_episodes_per_task: int = 60, relabel_probability: float = 0.8, **kwargs: Any) -> PEARL:
+    """
+    :param n_episodes_per_task: random episodes in the replay buffer, for each of 16 tasks
+    :param relabel_probability: K
+    :param kwargs: for PEARL
+    :return: a model that has collected, but not learnt yet
+    """
+    env = make_task_vec_env(ENV_ID, 16, seed=0)
+    # A context of 1024 steps needs 52 episodes
+    buffer = {"relabel_probability": relabel_probability, "context_episodes": 60}
+    sizes = {"n_tasks_per_rollout": 16, "n_episodes_per_task": n_episodes_per_task, "learning_starts": 10**9}
+    model = PEARL("MlpPolicy", env, replay_buffer_kwargs=buffer, seed=0, device="cpu", **{**sizes, **kwargs})
+    return model.learn(16 * 20 * n_episodes_per_task, log_interval=None)
+
+
+def write(name: str, figures: list[Figure]) -> None:
+    """
+    :param name: of the benchmark
+    :param figures: go to ``benchmarks/results/<name>.json``, and to the standard output
+    """
+    content = {
+        "name": name,
+        "command": " ".join(["python", f"benchmarks/{name}.py", *sys.argv[1:]]),
+        "date": date.today().isoformat(),
+        "machine": machine(),
+        "rows": [asdict(figure) for figure in figures],
+    }
+    RESULTS.mkdir(exist_ok=True)
+    with atomic_path(RESULTS / f"{name}.json") as path:
+        path.write_text(json.dumps(content, indent=1) + "\n")
+    print(json.dumps(content["rows"], indent=1))
+
+
+def machine() -> str:
+    """
+    :return: processor, threads and versions
+    """
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    processor = f"{names[0]}, {len(names)} cores" if names else platform.machine()
+    return f"{processor}, Python {platform.python_version()}, torch {th.__version__}, {th.get_num_threads()} thread(s)"

@@ -1,0 +1,68 @@
+"""Writes the tables of README.md and docs/performance.md from ``benchmarks/results/*.json``."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from _common import RESULTS
+
+from sb3_htr.experiments.tables import fill
+
+ROOT = Path(__file__).parents[1]
+
+
+def table(content: dict[str, Any]) -> str:
+    """
+    :param content: of a result file
+    :return: Markdown table, one line for each figure
+    """
+    head = ["what", "ours", "alternative", "ratio", "goal", "against"]
+    lines = [head, ["---"] * len(head)]
+    for row in content["rows"]:
+        ratio, goal = (f"{row[key]:.2f}" if row[key] else "" for key in ("ratio", "goal"))
+        ours, reference = (f"{row[key]:,.{_decimals(row[key])}f}" if row[key] else "" for key in ("ours", "reference"))
+        lines.append([row["name"], f"{ours} {row['unit']}", reference, ratio, goal, row["against"]])
+    text = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return f"{text}\n\n`{content['command']}`, {content['date']}, {content['machine']}.\n"
+
+
+def summary(contents: list[dict[str, Any]]) -> str:
+    """
+    :param contents: of result files
+    :return: Markdown table of the figures that had a goal, on one thread where there are several, against other libraries
+    """
+    lines = ["| | ours | times as fast as | |", "| --- | --- | --- | --- |"]
+    for content in contents:
+        for row in content.get("rows", []):
+            other_library = row["against"].startswith(("SB3", "katerakelly"))
+            if row["goal"] and other_library and "float32, 2 thread" not in row["name"] and "products, 2" not in row["name"]:
+                ours = f"{row['ours']:,.{_decimals(row['ours'])}f} {row['unit']}"
+                name = f"{content['name']}: {row['name'].removesuffix(', 1 thread(s)')}"
+                lines.append(f"| {name} | {ours} | {row['ratio']:.1f} | {row['against']} |")
+    return "\n".join(lines) + f"\n\n`make bench`, {contents[0]['machine']}.\n"
+
+
+def shares(content: dict[str, Any]) -> str:
+    """
+    :param content: of a profile
+    :return: Markdown table
+    """
+    lines = ["| part | share of wall time |", "| --- | --- |"]
+    lines += [f"| {row['name'].removeprefix('aten::')} | {row['share']:.1%} |" for row in content["shares"]]
+    return "\n".join(lines) + f"\n\n`{content['command']}`, {content['machine']}.\n"
+
+
+def _decimals(value: float) -> int:
+    return 0 if value >= 100 else 2 if value >= 1 else 3
+
+
+def main() -> None:
+    """All benchmarks that were run."""
+    contents = [json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))]
+    tables = {f"benchmark:{c['name']}": shares(c) if "shares" in c else table(c) for c in contents}
+    tables["benchmarks"] = summary(contents)
+    fill([ROOT / "README.md", ROOT / "docs" / "performance.md"], tables)
+
+
+if __name__ == "__main__":
+    main()
