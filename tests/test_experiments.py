@@ -1,6 +1,7 @@
 """From raw results to tables and pictures. The runs are made up; what is said of them must be true."""
 
 import json
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -8,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sb3_htr.experiments import goal_distance, point_robot, relabelling, report, tables, target_speed
+from sb3_htr.experiments import goal_distance, point_robot, precision, relabelling, report, tables, target_speed, wheeled
 from sb3_htr.experiments.report import Plot, episodes_to_first_success, loss_of_stability
-from sb3_htr.experiments.runner import LOGGED, Cell
+from sb3_htr.experiments.runner import LOGGED, Cell, run_cell
+from sb3_htr.pearl.resume import checkpoints
 from sb3_htr.zoo import intervals
 from sb3_htr.zoo.intervals import iqm_difference, iqm_interval
 
@@ -19,6 +21,8 @@ EXPERIMENTS: dict[str, tuple[Callable[[int, int], list[Cell]], Plot]] = {
     "relabelling": (relabelling.cells, relabelling.plot),
     "goal_distance": (goal_distance.cells, goal_distance.plot),
     "target_speed": (target_speed.cells, report.plot_learning),
+    "precision": (precision.cells, report.plot_learning),
+    "wheeled": (wheeled.cells, report.plot_learning),
 }
 
 
@@ -59,6 +63,28 @@ def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monk
     assert table.count("| 1.00 [1.00, 1.00] | 3.00 [3.00, 3.00] |") == len({cell.method for cell in cells(1, 1)}) * (
         len({str(cell.env_kwargs) for cell in cells(1, 1)})
     ) + sum(len(cell.explorers) - 1 for cell in cells(1, 1))
+
+
+def test_a_killed_run_of_an_experiment_goes_on(tmp_path: Path) -> None:
+    small: dict[str, Any] = {"n_envs": 4, "n_tasks_per_rollout": 4, "n_episodes_per_task": 3, "learning_starts": 240}
+    small |= {
+        "gradient_steps": 2,
+        "meta_batch_size": 4,
+        "batch_size": 4,
+        "policy_kwargs": {"net_arch": [8], "encoder_arch": [8]},
+    }
+    cell = Cell(wheeled.ENV_ID, "tiny", 1, 4 * 200 * 6, hyperparams=small, explorers=("search",))
+    command = cell.command(tmp_path / cell.name, 2400)
+    killed = subprocess.run([*command, "--save-freq", "1"], check=True, capture_output=True)
+    assert killed.returncode == 0
+    run = next((tmp_path / cell.name).glob("*/*"))
+    (run / f"{cell.env_id}.zip").unlink()
+    steps = checkpoints(run)[0].name
+    result = run_cell(cell, tmp_path, 2400)
+    assert f"Going on from {run / 'checkpoints' / steps}" in (tmp_path / cell.name / "log.txt").read_text()
+    raw = np.load(result)
+    assert raw["returns_search"].shape == (20, 20) and raw["timesteps"].tolist() == [2400, 4800]
+    assert len(list((tmp_path / cell.name).glob("*/*"))) == 1
 
 
 def test_statistics() -> None:

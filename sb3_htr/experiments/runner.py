@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 
 import htr_envs  # noqa: F401 registers the envs
-from sb3_htr import PEARL
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.evaluation import evaluate_adaptation
-from sb3_htr.common.vec_env import make_task_vec_env
-from sb3_htr.zoo.agents import find_run
+from sb3_htr.pearl.resume import checkpoints
+from sb3_htr.zoo.agents import agent_at, find_run
 
 # Means over the training of what HTR paper, B.2 reasons with
 LOGGED = ("relabelled_fraction", "rl_reward_mean", "rl_zero_reward_fraction")
@@ -84,11 +83,13 @@ def run_cell(cell: Cell, folder: Path, eval_freq: int) -> Path:
     start = time.monotonic()
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     (folder / cell.name).mkdir(parents=True, exist_ok=True)
+    command = _resume(folder / cell.name) or cell.command(folder / cell.name, eval_freq)
     with open(folder / cell.name / "log.txt", "a") as log:
-        subprocess.run(cell.command(folder / cell.name, eval_freq), check=True, stdout=log, stderr=log, env=environment)
+        subprocess.run(command, check=True, stdout=log, stderr=log, env=environment)
     wall = time.monotonic() - start
     run = find_run(folder / cell.name)
-    model = PEARL.load(run / f"{cell.env_id}.zip", device="cpu")
+    agent = agent_at(run, "last")
+    model, env = agent.load(), agent.make_vec_env(20)
     evaluations = np.load(run / "evaluations.npz")
     progress = np.genfromtxt(run / "progress.csv", delimiter=",", names=True, deletechars="")
     arrays: dict[str, Any] = {
@@ -98,7 +99,6 @@ def run_cell(cell: Cell, folder: Path, eval_freq: int) -> Path:
         "wall_s": wall,
         "commit": _commit(),
     }
-    env = make_task_vec_env(cell.env_id, 20, env_kwargs=cell.env_kwargs)
     for explorer in cell.explorers:
         returns, successes = evaluate_adaptation(model, env, explorer=explorer)
         arrays |= {f"returns_{explorer}": returns.astype(np.float32), f"successes_{explorer}": successes}
@@ -106,6 +106,12 @@ def run_cell(cell: Cell, folder: Path, eval_freq: int) -> Path:
         np.savez_compressed(path, **arrays)
     print(f"{cell.name}: {json.dumps({e: round(float(arrays[f'returns_{e}'][:, -1].mean()), 2) for e in cell.explorers})}")
     return result
+
+
+def _resume(folder: Path) -> list[str] | None:
+    """Command that goes on with a run that was killed, None if there is none."""
+    unfinished = [run for run in folder.glob("*/*") if checkpoints(run)]
+    return [sys.executable, "-m", "sb3_htr.zoo.cli", "train", "--resume", str(unfinished[-1])] if unfinished else None
 
 
 def _commit() -> str:
