@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
-
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
@@ -13,14 +11,17 @@ from htr_envs.task_split import split_evenly
 
 
 class SemicircleGoalFamily(TaskFamily):
-    """Goals (x, y) at one distance from the start, at angles from 0 to pi; a subclass says what reaching one is worth.
+    """Goals (x, y) at one distance from the start, at angles from 0 to pi.
+
+    A step is worth 1 minus the distance to the goal within the goal radius, and 0 outside, which is the formula that the HTR
+    paper (appendix A.3) gives for the point robot.
 
     The angles of the train and test tasks are evenly spaced and shuffled; those of the validation tasks are drawn uniformly.
     Everything follows ``task_seed``, never the seed of a run. The first two numbers of an observation are the position.
 
     :param arena: goals and hindsight goals lie in the square [-arena, arena]^2.
     :param goal_distance: distance of the goals from the start at (0, 0).
-    :param goal_radius: a goal is reached where the distance to it is smaller than this.
+    :param goal_radius: a goal is reached where the distance to it is smaller than this, at most 1.
     :param n_train_tasks: how many training tasks.
     :param n_test_tasks: how many test tasks.
     :param n_validation_tasks: how many validation tasks.
@@ -33,15 +34,17 @@ class SemicircleGoalFamily(TaskFamily):
         arena: float,
         goal_distance: float,
         goal_radius: float,
-        n_train_tasks: int,
-        n_test_tasks: int,
-        n_validation_tasks: int,
-        task_seed: int,
+        n_train_tasks: int = 80,
+        n_test_tasks: int = 20,
+        n_validation_tasks: int = 20,
+        task_seed: int = 1337,
     ) -> None:
         if not 0.0 < goal_distance <= arena:
             raise ValueError(f"goal_distance is {goal_distance}, expected a number above 0 and up to {arena}.")
-        if not goal_radius > 0.0:
-            raise ValueError(f"goal_radius is {goal_radius}, expected a number above 0.")
+        if not 0.0 < goal_radius <= 1.0:
+            raise ValueError(
+                f"goal_radius is {goal_radius}, expected above 0 and at most 1, so that a success is worth 1 - d > 0."
+            )
         self.goal_distance = float(goal_distance)
         self.goal_radius = float(goal_radius)
         angles = split_evenly(0.0, np.pi, n_train_tasks, n_validation_tasks, n_test_tasks, task_seed)
@@ -65,9 +68,9 @@ class SemicircleGoalFamily(TaskFamily):
         distance: FloatArray = np.sqrt(x * x + y * y, dtype=np.float32)
         return distance
 
-    @abstractmethod
     def _goal_reward(self, distance: FloatArray) -> FloatArray:
         """Sparse reward at these distances to the goal, where each of them reaches it."""
+        return np.float32(1.0) - distance
 
     def sample_tasks(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw goals at uniform angles.

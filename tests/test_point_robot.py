@@ -72,7 +72,8 @@ def test_tasks_lie_on_the_semicircle_in_the_numbers_asked_for(
     distance: float, counts: tuple[int, int, int], task_seed: int
 ) -> None:
     n_train, n_test, n_validation = counts
-    family = PointRobotFamily(distance, 0.2, n_train, n_test, n_validation, task_seed)
+    sizes = {"n_train_tasks": n_train, "n_test_tasks": n_test, "n_validation_tasks": n_validation}
+    family = PointRobotFamily(distance, 0.2, task_seed=task_seed, **sizes)
     sets = (family.train_tasks, family.test_tasks, family.validation_tasks, family.sample_tasks(7, np.random.default_rng(0)))
     assert [len(tasks) for tasks in sets] == [n_train, n_test, n_validation, 7]
     tasks = np.concatenate(sets)
