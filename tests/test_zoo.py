@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from conftest import ENV_ID, TINY
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_htr import PEARL
 from sb3_htr.common.vec_env import make_task_vec_env
@@ -183,6 +184,8 @@ def test_every_block_of_hyperparameters_trains(file: str, block: str) -> None:
     n_envs = settings.pop("n_envs")
     del settings["n_timesteps"]
     env = make_task_vec_env(ENV_ID if block == "default" else block, n_envs)
+    if normalize := settings.pop("normalize", None):
+        env = VecNormalize(env, **yaml.safe_load(normalize))
     # The settings as they are, but a short rollout and two updates
     model = PEARL(env=env, seed=0, **{**settings, "learning_starts": 0, "gradient_steps": 2, "n_episodes_per_task": 1})
     model.learn(1)
