@@ -34,7 +34,7 @@ def picture(env_id: str, task: list[float], actions: np.ndarray) -> np.ndarray:
     return np.asarray(env.render())
 
 
-# Docstrings of envs are Markdown, as in gymnasium: envs.md includes this copy
+# Docstrings of envs are Markdown, as in gymnasium: the pages in envs/ include these copies
 (HERE / "_build").mkdir(exist_ok=True)
 pages = {"point_robot": PointRobotEnv, "target_speed": TargetSpeedEnv, "wheeled": WheeledEnv, "ant": AntEnv}
 for name, env in pages.items():
