@@ -226,6 +226,16 @@ def test_search_settles_on_the_best_episode_after_setbacks(tiny_pearl: MakePEARL
         np.testing.assert_array_equal(settled, z[1])
 
 
+def test_an_episode_that_is_a_little_better_is_no_reason_to_search_on(tiny_pearl: MakePEARL) -> None:
+    policy = tiny_pearl().policy
+    known_tasks(policy, n=12)
+    adaptation = Adaptation(policy, 1, Explorer.SEARCH, 0, 64, th.Generator().manual_seed(0))
+    z = play(adaptation, [[5.0 + 0.01 * i] for i in range(MAX_SETBACKS + 3)])
+    # It settles on the best of them
+    np.testing.assert_array_equal(z[MAX_SETBACKS + 1], z[MAX_SETBACKS])
+    np.testing.assert_array_equal(z[MAX_SETBACKS + 2], z[MAX_SETBACKS])
+
+
 def test_the_posterior_of_search_sees_the_best_episode_only(tiny_pearl: MakePEARL) -> None:
     """The misses before it, whatever they were, make no difference."""
     policy = tiny_pearl().policy
