@@ -14,8 +14,8 @@ from sb3_htr.pearl.task_search import TaskSearch
 # anew), last return with 4 and with 6 12.9 and 12.8; without the training tasks 12.2 and 12.3.
 MAX_SETBACKS = 4
 # An episode counts as no setback if it is better than the best one by so much. The same z does not return the same from every
-# start, and of many episodes one is a little better. By measurement: on the Wheeled robot (two models, 40 tasks drawn anew) all
-# tasks are solved in the last episode with 1.02, 90 and 97 % with 1, because the agent never settled
+# start, and of many episodes one is a little better. By measurement: on the Wheeled robot (two models, 40 tasks drawn anew)
+# all tasks are solved in the last episode with 1.02, 90 and 97 % with 1, because the agent never settled
 CLEARLY_BETTER = 1.02
 # A return without its task-free part is that much above 0, or it is 0: the difference of two sums of float32
 ROUNDING = 1e-5
