@@ -1,0 +1,37 @@
+"""Float32 products of a linear layer: through oneDNN, as ``sb3_htr.common.linear`` does, against torch's own."""
+
+from functools import partial
+
+import numpy as np
+import torch as th
+from _common import Figure, by_turns, faster, seconds, write
+from torch.nn import functional as F
+
+from sb3_htr.common.linear import _product
+
+# Rows and units: a critic and the encoder at the paper's sizes, a critic of the fast profile
+SHAPES = [(4096, 300), (16384, 200), (1024, 128)]
+
+
+def main() -> None:
+    """One thread."""
+    th.set_num_threads(1)
+    figures = []
+    for n, units in SHAPES:
+        x, weight, bias = th.randn(n, units), th.randn(units, units), th.randn(units)
+        exact = F.linear(x.double(), weight.double(), bias.double())
+        errors = [float((f(x, weight, bias) - exact).abs().max()) for f in (_product, F.linear)]
+        times = by_turns(
+            {
+                "ours": partial(seconds, partial(_product, x, weight, bias), 20),
+                "torch": partial(seconds, partial(F.linear, x, weight, bias), 20),
+            }
+        )
+        ours, theirs = (2e-9 * n * units**2 / float(np.median(times[key])) for key in ("ours", "torch"))
+        name = f"{n} x {units} by {units} x {units}, largest error {errors[0]:.0e} (torch {errors[1]:.0e})"
+        figures.append(Figure(name, "GFLOP/s", ours, theirs, faster(times["ours"], times["torch"]), None, "torch's own"))
+    write("linear", figures)
+
+
+if __name__ == "__main__":
+    main()
