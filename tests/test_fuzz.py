@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 from conftest import ENV_ID, make_buffer, many
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from htr_envs import PointRobotFamily, TargetSpeedFamily
@@ -32,6 +32,7 @@ BUFFER_SETTINGS = [
 
 
 @many
+@example({"exploratory_fraction": "\n"}, True)
 @given(st.dictionaries(st.sampled_from(BUFFER_SETTINGS), anything, max_size=3), st.booleans())
 def test_buffers(kwargs: dict[str, Any], clustering: bool) -> None:
     try:

@@ -33,7 +33,7 @@ class GridDiscretiser:
         except (TypeError, ValueError):
             raise ValueError(f"cell_size is {cell_size!r}, expected positive widths.") from None
         if not ((self.cell_size > 0) & np.isfinite(self.cell_size)).all() or self.cell_size.size == 0:
-            raise ValueError(f"cell_size is {cell_size}, expected positive widths.")
+            raise ValueError(f"cell_size is {self.cell_size.tolist()}, expected positive widths.")
 
     def __call__(self, tasks: np.ndarray) -> np.ndarray:
         """
@@ -76,7 +76,7 @@ class EpisodeClustering(MultiTaskReplayBuffer):
         **kwargs: Any,
     ) -> None:
         if not (isinstance(exploratory_fraction, int | float) and 0 <= exploratory_fraction < 1):
-            raise ValueError(f"exploratory_fraction is {exploratory_fraction}, expected a number from 0 to below 1.")
+            raise ValueError(f"exploratory_fraction is {exploratory_fraction!r}, expected a number from 0 to below 1.")
         self.discretiser = GridDiscretiser(cell_size) if discretiser is None else discretiser
         self.exploratory_fraction = exploratory_fraction
         self._forget_hindsight()
