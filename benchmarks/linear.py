@@ -7,7 +7,7 @@ import torch as th
 from _common import Figure, by_turns, faster, seconds, write
 from torch.nn import functional as F
 
-from sb3_htr.common.linear import _product
+from sb3_htr.common.linear import Linear, _product
 
 # Rows and units: a critic and the encoder at the paper's sizes, a critic of the fast profile
 SHAPES = [(4096, 300), (16384, 200), (1024, 128)]
@@ -30,7 +30,22 @@ def main() -> None:
         ours, theirs = (2e-9 * n * units**2 / float(np.median(times[key])) for key in ("ours", "torch"))
         name = f"{n} x {units} by {units} x {units}, largest error {errors[0]:.0e} (torch {errors[1]:.0e})"
         figures.append(Figure(name, "GFLOP/s", ours, theirs, faster(times["ours"], times["torch"]), None, "torch's own"))
-    write("linear", figures)
+    write("linear", [*figures, context_figure()])
+
+
+def context_figure() -> Figure:
+    """First layer of the ant's encoder with its gradient: a context is a slice of the columns of the stored rows."""
+    n, columns, context_dim, units = 1536, 69, 38, 128
+    context = th.randn(n, columns)[:, :context_dim]
+    layers = {"ours": Linear(context_dim, units), "torch": th.nn.Linear(context_dim, units)}
+
+    def forward_and_backward(layer: th.nn.Linear) -> None:
+        layer(context).sum().backward()
+
+    times = by_turns({key: partial(seconds, partial(forward_and_backward, layer), 20) for key, layer in layers.items()})
+    ours, theirs = (4e-9 * n * context_dim * units / float(np.median(times[key])) for key in ("ours", "torch"))
+    name = f"{n} x {context_dim} of {columns} columns by {context_dim} x {units}, with its gradient"
+    return Figure(name, "GFLOP/s", ours, theirs, faster(times["ours"], times["torch"]), None, "torch's own")
 
 
 if __name__ == "__main__":

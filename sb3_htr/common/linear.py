@@ -19,12 +19,15 @@ class _OneDNNLinear(th.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:
+        # Of a slice of columns, as a context is one of the stored rows, oneDNN's product takes a hundred times as long
+        x = x.contiguous()
         ctx.save_for_backward(x, weight)
         return _product(x, weight, bias)
 
     @staticmethod
     def backward(ctx: Any, grad: th.Tensor) -> tuple[th.Tensor | None, th.Tensor | None, th.Tensor | None]:
         x, weight = ctx.saved_tensors
+        grad = grad.contiguous()
         return (
             _product(grad, weight.t(), None) if ctx.needs_input_grad[0] else None,
             _product_of_columns(grad, x) if ctx.needs_input_grad[1] else None,
