@@ -3,13 +3,14 @@
 import json
 import subprocess
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from sb3_htr.experiments import goal_distance, point_robot, precision, relabelling, report, tables, target_speed, wheeled
+from sb3_htr.experiments import goal_distance, locomotion, point_robot, precision, relabelling, report, tables, target_speed
 from sb3_htr.experiments.report import Plot, episodes_to_first_success, loss_of_stability
 from sb3_htr.experiments.runner import LOGGED, Cell, run_cell
 from sb3_htr.pearl.resume import checkpoints
@@ -22,7 +23,8 @@ EXPERIMENTS: dict[str, tuple[Callable[[int, int], list[Cell]], Plot]] = {
     "goal_distance": (goal_distance.cells, goal_distance.plot),
     "target_speed": (target_speed.cells, report.plot_learning),
     "precision": (precision.cells, report.plot_learning),
-    "wheeled": (wheeled.cells, report.plot_learning),
+    "wheeled": (partial(locomotion.cells, "SparseWheeled-v0"), report.plot_learning),
+    "ant": (partial(locomotion.cells, "SparseAnt-v0"), report.plot_learning),
 }
 
 

@@ -1,9 +1,18 @@
-"""Every package of the repository is in the wheel."""
+"""What is in the wheel, tried from an empty folder."""
 
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
 from configparser import ConfigParser
 from pathlib import Path
 
+import pytest
+from test_zoo import SMALL
+
 ROOT = Path(__file__).parents[1]
+SOURCES = ("sb3_htr", "htr_envs", "hyperparams", "trained_agents", "setup.cfg", "pyproject.toml", "README.md", "LICENSE")
 
 
 def test_setup_cfg_lists_every_package() -> None:
@@ -17,3 +26,38 @@ def test_setup_cfg_lists_every_package() -> None:
     }
     # These stay at the top of the repository and have no modules
     assert listed == found | {"sb3_htr.hyperparams", "sb3_htr.trained_agents"}
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the wheel is unpacked."""
+    source, dist, site = (tmp_path_factory.mktemp(name) for name in ("source", "dist", "site"))
+    for name in SOURCES:
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(ROOT / name, source)
+    build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(dist), str(source)]
+    subprocess.run(build, check=True, capture_output=True)
+    (wheel,) = dist.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(site)
+    return site
+
+
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        (["train", "--env", "SparseWheeled-v0", "-n", "480", "--verbose", "0", "-params", *SMALL], "Log path"),
+        (["enjoy", "--env", "SparsePointRobot-v0", "--n-episodes", "2", "--n-tasks", "1"], "htr-ser/SparsePointRobot-v0"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_the_wheel_works_from_an_empty_folder(site: Path, tmp_path: Path, command: list[str], says: str) -> None:
+    """With its YAML files, its MuJoCo model and its trained agents; what it imports is checked not to be the checkout."""
+    code = f"import sb3_htr, sys; assert sb3_htr.__file__.startswith({str(site)!r}); from sb3_htr.zoo.cli import console; console()"
+    environment = {**os.environ, "PYTHONPATH": str(site)}
+    run = subprocess.run(
+        [sys.executable, "-c", code, *command], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 0 and says in run.stdout, run.stdout + run.stderr
