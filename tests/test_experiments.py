@@ -75,7 +75,7 @@ def test_a_killed_run_of_an_experiment_goes_on(tmp_path: Path) -> None:
         "batch_size": 4,
         "policy_kwargs": {"net_arch": [8], "encoder_arch": [8]},
     }
-    cell = Cell(wheeled.ENV_ID, "tiny", 1, 4 * 200 * 6, hyperparams=small, explorers=("search",))
+    cell = Cell("SparseWheeled-v0", "tiny", 1, 4 * 200 * 6, hyperparams=small, explorers=("search",))
     command = cell.command(tmp_path / cell.name, 2400)
     killed = subprocess.run([*command, "--save-freq", "1"], check=True, capture_output=True)
     assert killed.returncode == 0

@@ -55,7 +55,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 )
 def test_the_wheel_works_from_an_empty_folder(site: Path, tmp_path: Path, command: list[str], says: str) -> None:
     """With its YAML files, its MuJoCo model and its trained agents; what it imports is checked not to be the checkout."""
-    code = f"import sb3_htr, sys; assert sb3_htr.__file__.startswith({str(site)!r}); from sb3_htr.zoo.cli import console; console()"
+    code = f"from sb3_htr.zoo import cli; assert cli.__file__.startswith({str(site)!r}); cli.console()"
     environment = {**os.environ, "PYTHONPATH": str(site)}
     run = subprocess.run(
         [sys.executable, "-c", code, *command], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
