@@ -11,7 +11,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     :param argv: arguments, by default those of the process
     """
-    run_experiment("ant", __doc__, partial(cells, "SparseAnt-v0"), 1_000_000, argv, eval_freq=100_000)
+    run_experiment("ant", __doc__, partial(cells, "SparseAnt-v0"), 600_000, argv, eval_freq=100_000)
 
 
 if __name__ == "__main__":
