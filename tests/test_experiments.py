@@ -10,7 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sb3_htr.experiments import goal_distance, locomotion, point_robot, precision, relabelling, report, tables, target_speed
+from sb3_htr.experiments import (
+    ant_settings,
+    goal_distance,
+    locomotion,
+    point_robot,
+    precision,
+    relabelling,
+    report,
+    tables,
+    target_speed,
+)
 from sb3_htr.experiments.report import Plot, episodes_to_first_success, loss_of_stability
 from sb3_htr.experiments.runner import LOGGED, Cell, run_cell
 from sb3_htr.pearl.resume import checkpoints
@@ -24,6 +34,7 @@ EXPERIMENTS: dict[str, tuple[Callable[[int, int], list[Cell]], Plot]] = {
     "target_speed": (target_speed.cells, report.plot_learning),
     "precision": (precision.cells, report.plot_learning),
     "wheeled": (partial(locomotion.cells, "SparseWheeled-v0"), report.plot_learning),
+    "ant_settings": (ant_settings.cells, report.plot_learning),
     "ant": (partial(locomotion.cells, "SparseAnt-v0"), report.plot_learning),
 }
 
@@ -65,6 +76,8 @@ def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monk
     assert table.count("| 1.00 [1.00, 1.00] | 3.00 [3.00, 3.00] |") == len({cell.method for cell in cells(1, 1)}) * (
         len({str(cell.env_kwargs) for cell in cells(1, 1)})
     ) + sum(len(cell.explorers) - 1 for cell in cells(1, 1))
+    line = f"{cells(1, 1)[0].env_id} | 20,000 | 3 | 2.0 [1."
+    assert (line in tables.headline({name: summary})) == (name in tables.ENVS)
 
 
 def test_a_killed_run_of_an_experiment_goes_on(tmp_path: Path) -> None:

@@ -9,6 +9,13 @@ from sb3_htr.common.atomic import atomic_path
 from sb3_htr.experiments.report import RESULTS
 
 DOCUMENTS = (RESULTS.parent / "README.md", RESULTS.parent / "docs" / "results.md", RESULTS.parent / "docs" / "performance.md")
+# Experiments and methods in the table of README.md
+ENVS = ("point_robot", "wheeled", "ant")
+METHODS = {
+    "htr-ser": "HTR, sparse rewards",
+    "pearl-dense": "PEARL, dense proxy reward",
+    "pearl-sparse": "PEARL, sparse rewards",
+}
 COLUMNS = {
     "last_episode_return": "return of the 20th episode",
     "success_rate": "tasks solved in it",
@@ -38,6 +45,28 @@ def table(summary: dict[str, Any]) -> str:
     )
 
 
+def headline(summaries: dict[str, dict[str, Any]]) -> str:
+    """
+    :param summaries: contents of ``summary.json`` by their names, those of ``ENVS`` among them where they are there
+    :return: Markdown table, one line per env, with each method under the explorer that its runs name first
+    """
+    lines = [["env", "env steps", "seeds", *METHODS.values()], ["---"] * (3 + len(METHODS))]
+    for summary in (summaries[name] for name in ENVS if name in summaries):
+        cells = []
+        for method in METHODS:
+            rows = [row for row in summary["rows"] if row["method"] == method]
+            score = {row["metric"]: row for row in rows if row["explorer"] == rows[0]["explorer"]}
+            cells.append(
+                "{iqm:.1f} [{low:.1f}, {high:.1f}], ".format(**score["last_episode_return"])
+                + f"{score['success_rate']['iqm']:.0%} solved"
+                if rows
+                else ""
+            )
+        first = summary["rows"][0]
+        lines.append([first["env"], f"{first['env_steps']:,}", str(first["n_seeds"]), *cells])
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
 def fill(documents: Iterable[Path], tables: dict[str, str]) -> None:
     """
     Replace what stands between ``<!-- NAME -->`` and ``<!-- end -->``.
@@ -59,7 +88,8 @@ def fill(documents: Iterable[Path], tables: dict[str, str]) -> None:
 def main() -> None:
     """All results that are there."""
     summaries = [json.loads(path.read_text()) for path in sorted(Path(RESULTS).glob("*/summary.json"))]
-    fill(DOCUMENTS, {f"results:{summary['name']}": table(summary) for summary in summaries})
+    tables = {f"results:{summary['name']}": table(summary) for summary in summaries}
+    fill(DOCUMENTS, {**tables, "headline": headline({summary["name"]: summary for summary in summaries})})
 
 
 if __name__ == "__main__":
