@@ -175,11 +175,44 @@ def test_a_meta_batch_may_be_larger_than_the_number_of_tasks(tiny_pearl: MakePEA
     tiny_pearl(env, n_tasks_per_rollout=2, meta_batch_size=50).learn(2 * ROLLOUT)
 
 
-def test_unknown_keys_of_a_yaml_file_are_refused_with_the_nearest_known_one(tmp_path: Path) -> None:
-    arguments = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-n", "10", "-params"]
-    with pytest.raises(ValueError, match=r"PEARL has no setting 'kl_coeff': did you mean kl_coef\?"):
-        main([*arguments, "kl_coeff:0.1"])
-    assert not list(tmp_path.rglob("*.zip"))
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--env", ENV_ID, "-n", "10", "-params", "kl_coeff:0.1"], r"PEARL has no setting 'kl_coeff': did you mean kl_coef\?"),
+        (
+            ["--env", ENV_ID, "-params", "policy_kwargs:{'latent_dimm': 3}"],
+            "policy_kwargs has no setting 'latent_dimm': did you",
+        ),
+        (["--env", ENV_ID, "-params", "gamma:abc"], "'abc' is not defined: the values of -params .* strings in quotes"),
+        (["--env", ENV_ID, "-params", "gamma=0.9"], "the values of -params and --env-kwargs are Python"),
+        (["--env", ENV_ID, "-params", "n_envs:0"], "n_envs is 0, expected a whole number of at least 1"),
+        (["--env", ENV_ID, "-n", "0"], "n_timesteps is 0, expected a whole number of at least 1"),
+        (["--env", ENV_ID, "-n", "-5"], "n_timesteps is -5"),
+        (["--env", "CartPole-v1"], "The env has no task_family, so there are no tasks to meta-train on"),
+        (["-n", "10"], "--env is missing"),
+        (
+            ["--env", ENV_ID, "--trial-id", "9", "--study-name", "s", "--storage", "sqlite:///:memory:"],
+            "no study 's' with a trial 9",
+        ),
+        (["--env", "Speed-v0", "--gym-packages", "not_there"], "The module not_there is not found: install it"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_what_cannot_be_trained_is_refused_in_one_sentence(
+    arguments: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises((ValueError, ImportError), match=message) as refusal:
+        main(["train", *arguments])
+    assert "\n" not in str(refusal.value) and not list(tmp_path.rglob("*.zip"))
+
+
+def test_only_the_envs_of_a_model_can_be_adapted_to(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    with pytest.raises(ValueError, match="The env has no task_family"):
+        model.adapt(gym.make("CartPole-v1"))
+    with pytest.raises(ValueError, match="spaces do not match"):
+        model.adapt(gym.make("SparseTargetSpeed-v0"))
 
 
 numbers = st.one_of(st.integers(-3, 300), st.floats(-2, 2), st.just(float("nan")), st.just(float("inf")))

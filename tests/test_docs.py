@@ -1,7 +1,7 @@
 """The Python of the manual and of the README runs, and so do the commands."""
 
-import importlib
 import re
+import runpy
 import shlex
 from pathlib import Path
 
@@ -28,9 +28,8 @@ def test_the_code_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.chdir(tmp_path)
     # The README trains for minutes; here it is for a moment
     code = python_blocks(page).replace("model.learn()", "model.learn(8000)")
-    (tmp_path / f"page_{page.stem}.py").write_text(code)
-    monkeypatch.syspath_prepend(tmp_path)
-    importlib.import_module(f"page_{page.stem}")
+    (tmp_path / "page.py").write_text(code)
+    runpy.run_path("page.py", run_name="__main__")
 
 
 def test_a_new_family_takes_less_than_60_lines() -> None:

@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_no
 
 from sb3_htr.common.type_aliases import TaskFamily
 
+TASK_ENV_ADVICE = "derive the env from htr_envs.TaskEnv and test it with htr_envs.check_task_env"
 VARIADIC = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
 
 
@@ -63,19 +64,26 @@ def check_keywords(owner: str, given: Iterable[str], function: Callable[..., Any
             raise ValueError(f"{owner} has no setting {name!r}: {advice}")
 
 
+def check_has_task_family(has_task_family: bool) -> None:
+    """
+    :param has_task_family: whether an env has the attribute
+    :raises ValueError: if it has not
+    """
+    if not has_task_family:
+        raise ValueError(f"The env has no task_family, so there are no tasks to meta-train on: {TASK_ENV_ADVICE}.")
+
+
 def get_task_family(env: VecEnv) -> TaskFamily:
     """
     :param env: env to train on
     :return: its task family
     :raises ValueError: if it has none
     """
-    advice = "derive the env from htr_envs.TaskEnv and test it with htr_envs.check_task_env"
-    if not env.has_attr("task_family"):
-        raise ValueError(f"The env has no task_family, so there are no tasks to meta-train on: {advice}.")
+    check_has_task_family(env.has_attr("task_family"))
     family: TaskFamily = env.get_attr("task_family")[0]
     for name in ("compute_reward", "is_success", "hindsight_task", "train_tasks"):
         if not hasattr(family, name):
-            raise ValueError(f"The env's task_family has no {name}, which hindsight relabelling needs: {advice}.")
+            raise ValueError(f"The env's task_family has no {name}, which hindsight relabelling needs: {TASK_ENV_ADVICE}.")
     return family
 
 

@@ -12,6 +12,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
+from sb3_htr.common.checks import check_has_task_family, check_numbers
+
 # Attributes of a single task env, and where a batched one keeps those of all envs
 PER_ENV = {"task": "tasks", "task_id": "task_ids"}
 
@@ -110,7 +112,9 @@ def make_task_vec_env(
     :param monitor_dir: folder for the CSV of episode returns, none by default
     :param env_kwargs: arguments of the env
     :return: a monitored VecEnv
+    :raises ValueError: for an env without tasks, or no envs
     """
+    check_numbers(n_envs=(n_envs, 1, float("inf")))
     module, _, env_id = env_id.rpartition(":")
     if module:
         importlib.import_module(module)
@@ -118,6 +122,7 @@ def make_task_vec_env(
     if spec.vector_entry_point is None:
         return make_vec_env(env_id, n_envs, seed=seed, monitor_dir=monitor_dir, env_kwargs=env_kwargs)
     vector_env = gym.make_vec(env_id, n_envs, vectorization_mode="vector_entry_point", **(env_kwargs or {}))
+    check_has_task_family(hasattr(vector_env, "task_family"))
     monitor_file = None if monitor_dir is None else os.path.join(monitor_dir, "0.monitor.csv")
     venv = VecMonitor(BatchedTaskVecEnv(vector_env), monitor_file, info_keywords=("is_success",))
     venv.seed(seed)

@@ -5,9 +5,11 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import torch as th
+from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.sac import SAC
 
+from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.evaluation import run_adaptation
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.pearl.adaptation import Adaptation
@@ -65,12 +67,15 @@ class AdaptsAtMetaTest(SAC):
         :param deterministic: adapt with mean actions instead of samples
         :param seed: seed of z
         :return: an agent for this task, with the returns of its adaptation episodes
+        :raises ValueError: for several envs, an env without tasks or with other spaces, a task that the env does not have
         """
         if n_episodes < 1:
             raise ValueError(f"n_episodes is {n_episodes}, expected at least 1.")
         vec_env = make_task_vec_env(env) if isinstance(env, str) else self._wrap_env(env, monitor_wrapper=False)
         if vec_env.num_envs != 1:
             raise ValueError(f"adapt() adapts to one task, but the VecEnv has {vec_env.num_envs} envs: pass a single env.")
+        get_task_family(vec_env)
+        check_for_correct_spaces(vec_env, self.observation_space, self.action_space)
         if task is None:
             vec_env.reset()
             task = np.array(vec_env.get_attr("task")[0])
@@ -79,7 +84,8 @@ class AdaptsAtMetaTest(SAC):
         record = run_adaptation(self.policy, vec_env, adaptation, n_episodes, deterministic)
         if adaptation.best_return[0] <= 0:
             warnings.warn(
-                f"No reward was found in {n_episodes} episodes, so the agent is not adapted: allow more.", stacklevel=2
+                f"No reward was found in {n_episodes} episodes, so the agent is not adapted: allow more, or train longer.",
+                stacklevel=2,
             )
         return AdaptedAgent(self.policy, adaptation.frozen_z()[0], record.returns[0], record.successes[0])
 

@@ -165,6 +165,7 @@ class PEARL(AdaptsAtMetaTest, SavesToFiles):
         )
         # SAC adds an argument for state-dependent exploration, which PEARL does not have: z explores
         self.policy_kwargs.pop("use_sde")
+        checks.check_keywords("policy_kwargs", self.policy_kwargs, self.policy_class)
         self.meta_batch_size = meta_batch_size
         self.context_size = context_size
         self.kl_coef = kl_coef

@@ -34,7 +34,8 @@ EXTRAS = {
     "tensorboard": "tensorboard",
     "psycopg": "postgresql",
 }
-# What a user can put right: bad settings and files, missing packages, unknown envs, training that diverges
+# What a user can put right, and has a sentence of its own: bad settings and files, missing packages, unknown envs, training
+# that diverges
 MISTAKES = (ValueError, OSError, ImportError, gymnasium.error.Error, FloatingPointError)
 
 
@@ -55,6 +56,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         importlib.import_module(f"sb3_htr.zoo.{command}").main(rest)
     except ModuleNotFoundError as error:
         package = (error.name or "").split(".")[0]
+        if package in rest:
+            raise ImportError(f"The module {package} is not found: install it, or add its folder to PYTHONPATH.") from None
         if package not in EXTRAS:
             raise
         print(
@@ -67,18 +70,21 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def console() -> int:
     """
-    :return: exit status of :func:`main`; 1 and a sentence, without the way to it, for what a user can put right
+    :return: exit status of :func:`main`; 1 and a sentence, without the way to it, for an error
     """
+    # Modules of one's own beside what one works on, as `python -m` has it
+    sys.path.append(os.getcwd())
     try:
         return main()
     except BrokenPipeError:
         # Whoever reads the output, as `head` does, has seen enough; nothing more can be written at the end either
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except MISTAKES as error:
+    except Exception as error:
         if os.environ.get("SB3_HTR_TRACEBACK"):
             raise
-        print(f"sb3-htr: {error}\n(SB3_HTR_TRACEBACK=1 in the environment shows where this comes from)", file=sys.stderr)
+        name = "" if isinstance(error, MISTAKES) else f"{type(error).__name__}: "
+        print(f"sb3-htr: {name}{error}\n(SB3_HTR_TRACEBACK=1 in the environment shows where this comes from)", file=sys.stderr)
         return 1
 
 

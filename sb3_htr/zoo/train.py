@@ -1,6 +1,7 @@
 """``sb3-htr train``: rl_zoo3's training with PEARL in it, and with evaluations that adapt."""
 
 import argparse
+import importlib
 import json
 import signal
 import sys
@@ -30,7 +31,7 @@ import htr_envs  # noqa: F401 registers the envs
 from sb3_htr import PEARL
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.callbacks import MetaEvalCallback, MetaTrialEvalCallback, ProgressCallback
-from sb3_htr.common.checks import check_keywords
+from sb3_htr.common.checks import check_keywords, check_numbers
 from sb3_htr.common.memory import keep_freed_memory
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.pearl.divergence import DivergedError
@@ -73,10 +74,17 @@ class MetaExperimentManager(ExperimentManager):
 
         :return: hyperparameters, and the same sorted to be saved
         """
+        if self.n_timesteps != -1:
+            check_numbers(n_timesteps=(self.n_timesteps, 1, float("inf")))
         trial_id, self.trial_id = self.trial_id, None
         hyperparams, saved = super().read_hyperparameters()
         if self.storage and self.study_name and trial_id is not None:
-            trial = self.load_trial(self.storage, self.study_name, trial_id)
+            try:
+                trial = self.load_trial(self.storage, self.study_name, trial_id)
+            except (KeyError, IndexError):
+                raise ValueError(
+                    f"{self.storage} has no study {self.study_name!r} with a trial {trial_id}: `sb3-htr optimize` prints both."
+                ) from None
             for key in trial.keys() - (self.custom_hyperparams or {}).keys():
                 value, given = trial[key], hyperparams.get(key)
                 hyperparams[key] = {**given, **value} if isinstance(value, dict) and isinstance(given, dict) else value
@@ -88,6 +96,7 @@ class MetaExperimentManager(ExperimentManager):
         self, hyperparams: dict[str, Any]
     ) -> tuple[dict[str, Any], Callable[..., Any] | None, list[BaseCallback], Callable[..., Any] | None]:
         check_keywords("PEARL", hyperparams, PEARL, also=ZOO_SETTINGS)
+        check_numbers(n_envs=(hyperparams.get("n_envs", 1), 1, float("inf")))
         processed = super()._preprocess_hyperparams(without_code(hyperparams))
         if self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = dict(self.env_kwargs)
@@ -129,6 +138,8 @@ class MetaExperimentManager(ExperimentManager):
         """Make the run's folder, or take the one of the run that goes on; a search has none."""
         if self.optimize_hyperparameters:
             return
+        if self.tensorboard_log:
+            importlib.import_module("tensorboard")  # missing, it should be said before anything is written
         if self.resumed is not None:
             self.save_path = str(self.resumed)
             self.params_path = f"{self.save_path}/{self.env_name}"
@@ -138,7 +149,8 @@ class MetaExperimentManager(ExperimentManager):
         super().create_log_folder()
 
     def create_callbacks(self) -> None:
-        """Add the log of training, ``progress.csv``."""
+        """Add the log of training, ``progress.csv``; a run shorter than ``--eval-freq`` is evaluated at its end."""
+        self.eval_freq = min(self.eval_freq, self.n_timesteps)
         super().create_callbacks()
         self.callbacks.append(ProgressCallback(Path(self.save_path) / "progress.csv"))
         self._checkpointing = next((call for call in self.callbacks if isinstance(call, CheckpointCallback)), None)
@@ -167,8 +179,8 @@ class MetaExperimentManager(ExperimentManager):
                 last = next(iter(checkpoints(Path(self.save_path))), None)
                 raise DivergedError(f"{error} The last checkpoint: {last or 'none yet'}.") from None
             finally:
-                unfinished = model.num_timesteps < self.n_timesteps
-                if self._checkpointing is not None and (unfinished or self._checkpointing.stopping):
+                stopping = self._checkpointing is not None and self._checkpointing.stopping
+                if checkpoints(Path(self.save_path)) and (stopping or model.num_timesteps < self.n_timesteps):
                     print(f"To go on: sb3-htr train --resume {self.save_path}")
                 assert model.env is not None
                 model.env.close()
@@ -186,9 +198,11 @@ class MetaExperimentManager(ExperimentManager):
             raise optuna.TrialPruned from error
 
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
+        # As used: -n may have replaced the file's
+        used = {**saved_hyperparams, "n_timesteps": self.n_timesteps}
         if self.resumed is not None:
             before = json.loads((self.resumed / "run.json").read_text())["hyperparams"]
-            now = json.loads(json.dumps(saved_hyperparams))
+            now = json.loads(json.dumps(used))
             if before != now:
                 changed = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
                 raise ValueError(
@@ -207,7 +221,7 @@ class MetaExperimentManager(ExperimentManager):
             "arguments": sys.argv[1:],
             "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
             "versions": {name: version(name) for name in PACKAGES if _is_installed(name)},
-            "hyperparams": saved_hyperparams,
+            "hyperparams": used,
         }
         with atomic_path(Path(self.save_path) / "run.json") as path:
             path.write_text(json.dumps(run, indent=2, default=str))
@@ -267,6 +281,8 @@ def _arguments(argv: Sequence[str]) -> tuple[list[str], Path | None]:
     if args.algo != "pearl":
         raise ValueError(f"--algo is {args.algo!r}, but sb3-htr trains pearl: `python -m rl_zoo3.train` has SB3's algorithms.")
     if args.resume is None:
+        if not {"-h", "--help"} & set(rest) and not any(argument.split("=")[0] == "--env" for argument in rest):
+            raise ValueError("--env is missing: give the id of a task env, as in `sb3-htr train --env SparsePointRobot-v0`.")
         # Later arguments win, so these are defaults. One thread: two runs on two cores must not fight for them.
         defaults = ["--algo", "pearl", "-conf", str(hyperparams_file()), "--num-threads", "1", "--save-freq", "20000"]
         return [*defaults, *rest], None
@@ -291,6 +307,10 @@ def main(argv: Sequence[str]) -> None:
     MetaExperimentManager.resumed = run
     try:
         rl_zoo3.train.train()
+    except (NameError, SyntaxError) as error:
+        raise ValueError(
+            f"{error}: the values of -params and --env-kwargs are Python, with strings in quotes, as in \"explorer:'prior'\"."
+        ) from error
     finally:
         sys.argv = before
         MetaExperimentManager.resumed = None
