@@ -92,7 +92,8 @@ def summarize(name: str, results: dict[Cell, Path]) -> dict[str, Any]:
 
 
 def _rounded(interval: tuple[float, float, float]) -> dict[str, float]:
-    return {key: round(value, 3) for key, value in zip(("iqm", "low", "high"), interval, strict=True)}
+    # adding 0 turns -0 into 0
+    return {key: round(value, 3) + 0.0 for key, value in zip(("iqm", "low", "high"), interval, strict=True)}
 
 
 def _processor() -> str:
