@@ -59,9 +59,8 @@ class TrainedAgent:
         """
         try:
             th.empty(0, device=get_device(device))
-        except (RuntimeError, AssertionError, NotImplementedError) as error:
-            reason = str(error).splitlines()[0]
-            raise ValueError(f"The device {device!r} cannot be used: give cpu, cuda or cuda:N ({reason}).") from None
+        except (RuntimeError, AssertionError, NotImplementedError):
+            raise ValueError(f"The device {device!r} cannot be used: give cpu, cuda or cuda:N.") from None
         try:
             return PEARL.load(self.path, device=device)
         except RuntimeError as error:
