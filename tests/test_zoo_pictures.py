@@ -2,13 +2,13 @@
 
 import warnings
 from pathlib import Path
-from typing import ClassVar
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from broken_envs import LineEnv
 from conftest import ENV_ID, TINY
+from gymnasium.envs.registration import EnvSpec
 from matplotlib.figure import Figure
 
 from sb3_htr import PEARL
@@ -29,15 +29,14 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
 class Boastful(LineEnv):
     """Says that it can be drawn, but cannot."""
 
-    metadata: ClassVar = {"render_modes": ["rgb_array"]}
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
 
 
 @pytest.fixture
 def line_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An agent of an env as in docs/own_task_family.md: its constructor knows no render_mode."""
-    monkeypatch.setitem(
-        gym.registry, "SparseLine-v0", gym.envs.registration.EnvSpec("SparseLine-v0", LineEnv, max_episode_steps=10)
-    )
+    spec = EnvSpec("SparseLine-v0", "broken_envs:LineEnv", max_episode_steps=10)
+    monkeypatch.setitem(gym.registry, spec.id, spec)
     path = tmp_path / "line.zip"
     PEARL("MlpPolicy", gym.make("SparseLine-v0"), **TINY).save(path)
     return path
@@ -70,7 +69,8 @@ def test_paths_begin_at_the_start_and_name_their_task(drawn: list[Figure]) -> No
     plots.plot_adaptation_paths(record, tasks, 0.2, start, Path("x.png"), "about")
     axes = drawn[0].axes[0]
     assert axes.get_title().startswith("task 2: solved in episode 1")
-    assert all(tuple(line.get_xydata()[0]) == (0, 0) and len(line.get_xydata()) == 5 for line in axes.lines)
+    ways = [np.asarray(line.get_xydata()) for line in axes.lines]
+    assert all(way.shape == (5, 2) and (way[0] == 0).all() for way in ways)
 
 
 def test_curves_say_what_they_show(drawn: list[Figure], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -198,7 +198,7 @@ def plot_adapted(args: argparse.Namespace, env_id: str, adapted: dict[str, list[
             labels = ("return", "share of tasks solved (%)")
             plot_curves(curves, new("adaptation_curve.png"), about, "adaptation episode", labels)
     if "paths" in args.only and first.tasks.shape[1] == 2:
-        title = f"{env_id}, {label}, explorer {first.explorer}"
+        title = f"{env_id}, {label}, {args.tasks} tasks, explorer {first.explorer}"
         plot_adaptation_paths(first.record, first.tasks, first.goal_radius, first.start, new("adaptation_paths.png"), title)
     found = first.found
     if "latent" in args.only and found.sum() < 2:
