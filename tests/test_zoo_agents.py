@@ -22,6 +22,7 @@ from sb3_htr.common.evaluation import AdaptationRecord, record_adaptation
 from sb3_htr.zoo import cli, model_card, window
 from sb3_htr.zoo.agents import RECORD, agent_at, agent_for
 from sb3_htr.zoo.cli import main
+from sb3_htr.zoo.export import push_to_hub
 from sb3_htr.zoo.play import Moment, Player
 from sb3_htr.zoo.plot import check_same_settings
 from sb3_htr.zoo.shipped import shipped
@@ -68,6 +69,10 @@ def run(tmp_path: Path, tiny_pearl: Callable[..., PEARL]) -> Path:
 def test_agents_are_found_by_run_file_and_env(run: Path, tiny_pearl: Callable[..., PEARL], tmp_path: Path) -> None:
     logs = tmp_path / "logs"
     last = make_run(logs, tiny_pearl(), number=12)
+    with pytest.raises(FileNotFoundError, match=r"SparsePointRobot-v0 run 77 in .*, only runs 1 \(pearl\), 12 \(pearl\)"):
+        agent_for(ENV_ID, logs, exp_id=77)
+    with pytest.raises(ValueError, match=r"evaluations.npz is no model file"):
+        agent_at(run / "evaluations.npz")
     unfinished = logs / "pearl" / f"{ENV_ID}_13"
     unfinished.mkdir()
     shutil.copy(last / RECORD, unfinished / RECORD)
@@ -94,6 +99,9 @@ def test_agents_that_are_not_there_are_said_to_be_so(tmp_path: Path, tiny_pearl:
         ([str(tmp_path / "absent")], "absent does not exist: give a run folder"),
         ([str(tmp_path / "loose.zip")], "does not say which env it was trained on: add --env ID"),
         ([*NOWHERE, "--task", "21"], "There is no test task 21: --task takes numbers from 1 to 20"),
+        ([*NOWHERE, "--n-tasks", "0"], "--n-tasks is 0, expected at least 1"),
+        ([*NOWHERE, "--device", "cudaa"], "The device 'cudaa' cannot be used: give cpu, cuda or cuda:N"),
+        ([str(SHIPPED), "--env", "SparseAnt-v0"], "was trained on SparsePointRobot-v0, but --env is SparseAnt-v0"),
         ([*NOWHERE, "--n-episodes", "0"], "--n-episodes is 0, expected at least 1"),
         ([*NOWHERE, "--gym-packages", "no_such_module"], "The env needs the module no_such_module"),
     ):
@@ -104,6 +112,8 @@ def test_agents_that_are_not_there_are_said_to_be_so(tmp_path: Path, tiny_pearl:
 
 
 def test_enjoy_shows_an_agent_that_adapts(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["enjoy", *NOWHERE, "--no-render", "--n-tasks", "50", "--n-episodes", "1"]) == 0
+    assert "There are only 20 test tasks, fewer than --n-tasks 50" in capsys.readouterr().out
     assert main(["enjoy", *NOWHERE, "--no-render", "--n-tasks", "2", "--n-episodes", "6"]) == 0
     lines = capsys.readouterr().out.splitlines()
     episodes = [line for line in lines if line.startswith("  episode")]
@@ -255,6 +265,9 @@ def test_a_folder_to_share_says_how_to_use_it(
     assert main(arguments) == 0
     assert uploaded == {"me/agent": {"README.md", f"{ENV_ID}.zip"}}
     assert "Uploaded to https://hub/me/agent" in capsys.readouterr().out
+    monkeypatch.setattr(HfApi, "upload_folder", lambda *_, **__: (_ for _ in ()).throw(ConnectionError("no network")))
+    with pytest.raises(OSError, match=f"The upload to me/agent failed, the files are in {tmp_path}: no network"):
+        push_to_hub(tmp_path, "me/agent", private=True)
     card = (tmp_path / "README.md").read_text()
     metadata = yaml.safe_load(card.split("---")[1])
     assert metadata["library_name"] == "stable-baselines3" and ENV_ID in metadata["tags"]
@@ -345,6 +358,14 @@ def test_captions_know_what_was_worst(tmp_path: Path) -> None:
     assert (first[:101, :201] == 0).all(), "the frame itself is not touched"
     dark = [(picture[101:] < 60).all(axis=-1).sum() for picture in (first, last)]
     assert dark[1] < dark[0], "the bar of the uncertainty is shorter"
+
+
+def test_the_card_says_how_long_the_training_was() -> None:
+    record = {"env_id": ENV_ID, "env_kwargs": {}, "gym_packages": [], "seed": 1, "num_timesteps": 8000, "model": "last"}
+    record |= {"n_timesteps": 8000, "hyperparams": {"n_timesteps": 150000.0, "gamma": 0.9}}
+    scores = {"search": AdaptationRecord(np.ones((2, 7)), np.ones((2, 7), dtype=bool), np.zeros((2, 7, 1, 1)))}
+    card = model_card.model_card(record, scores)
+    assert "n_timesteps: 8000\n" in card and "150000" not in card and "gamma: 0.9" in card
 
 
 def test_tables_show_the_last_episode() -> None:

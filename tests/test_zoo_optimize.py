@@ -1,5 +1,6 @@
 """``sb3-htr optimize``: what is searched for, and where the study is kept."""
 
+import logging
 import os
 import shutil
 import subprocess
@@ -127,6 +128,29 @@ def test_bad_storages_are_named_in_one_sentence(quick: None, tmp_path: Path) -> 
         search(tmp_path, "study.db")
     with pytest.raises(ValueError, match=r"The storage sqlite:////nowhere/study.db cannot be used: unable to open"):
         search(tmp_path, "sqlite:////nowhere/study.db")
+
+
+def test_a_search_that_learnt_nothing_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said: list[str] = []
+    handler = logging.Handler()
+    handler.emit = lambda record: said.append(record.getMessage())  # type: ignore[method-assign]
+    monkeypatch.setattr(logging.getLogger("optuna.study.study"), "handlers", [handler])
+    values = [0.0, 0.0]
+
+    def two_trials(_: Any) -> None:
+        study = optimize.create_study(f"{tmp_path}/s.log", "test")
+        study.add_trials([optuna.trial.create_trial(value=value) for value in values])
+
+    monkeypatch.setattr(train, "main", two_trials)
+    assert search(tmp_path, f"{tmp_path}/s.log") == 0
+    assert "No trial learnt anything: the return after adaptation is 0 in all 2" in capsys.readouterr().out
+    assert not [text for text in said if "existing study" in text], "it is new"
+    values[0] = 0.5
+    assert search(tmp_path, f"{tmp_path}/s.log") == 0
+    assert "--trial-id 2" in capsys.readouterr().out
+    assert len([text for text in said if "existing study" in text]) == 1
 
 
 def test_what_is_sampled_makes_a_model_and_is_what_is_loaded() -> None:

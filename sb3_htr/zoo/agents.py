@@ -1,5 +1,6 @@
 """Trained agents: where they are, and the env that each was trained on."""
 
+import contextlib
 import importlib
 import json
 import os
@@ -11,7 +12,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch as th
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 import htr_envs  # noqa: F401 registers the envs
@@ -51,8 +55,12 @@ class TrainedAgent:
         """
         :param device: torch device
         :return: the model
-        :raises ValueError: for a model whose networks are not those of this version
+        :raises ValueError: for a device that cannot be used, or a model whose networks are not those of this version
         """
+        try:
+            th.empty(0, device=get_device(device))
+        except (RuntimeError, AssertionError, NotImplementedError):
+            raise ValueError(f"The device {device!r} cannot be used: give cpu, cuda or cuda:N.") from None
         try:
             return PEARL.load(self.path, device=device)
         except RuntimeError as error:
@@ -66,14 +74,27 @@ class TrainedAgent:
         """
         :param render_mode: of the env
         :return: one env, whose observations are not normalized
+        :raises ValueError: if it has no such mode
         """
-        return gym.make(self.env_id, render_mode=render_mode, **self.record["env_kwargs"])
+        # An env that cannot be drawn need not know the argument
+        drawn: dict[str, Any] = {} if render_mode is None else {"render_mode": render_mode}
+        try:
+            return gym.make(self.env_id, **self.record["env_kwargs"], **drawn)
+        except TypeError as error:
+            if not drawn or "'render_mode'" not in str(error):
+                raise
+            raise ValueError(
+                f"{self.env_id} cannot draw {render_mode}: let the __init__ of its class take render_mode, and hand it on."
+            ) from None
 
     def make_vec_env(self, n_envs: int) -> VecEnv:
         """
         :param n_envs: number of envs
         :return: the envs, in the VecNormalize of the training if that had one
         """
+        if gym.spec(self.env_id).vector_entry_point is None:
+            # By its id, SB3 would ask for a render mode that it may not have
+            return self.normalized(make_vec_env(self.make_env, n_envs))
         return self.normalized(make_task_vec_env(self.env_id, n_envs, env_kwargs=self.record["env_kwargs"]))
 
     def normalized(self, env: VecEnv) -> VecEnv:
@@ -164,12 +185,13 @@ def agent_at(path: str | os.PathLike[str], which: str = "best", env_id: str | No
         return TrainedAgent(find_model(run, record["env_id"], which), record, run)
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist: give a run folder, a folder of runs, or a model file (.zip).")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            if RECORD in archive.namelist():
-                return TrainedAgent(path, json.loads(archive.read(RECORD)), None)
-    except zipfile.BadZipFile:
-        raise ValueError(f"{path} is no model file: give a run folder, or a .zip saved by PEARL.") from None
+    names: list[str] = []
+    with contextlib.suppress(zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
+        names = archive.namelist()
+        if RECORD in names:
+            return TrainedAgent(path, json.loads(archive.read(RECORD)), None)
+    if "data" not in names:
+        raise ValueError(f"{path} is no model file: give a run folder, or a .zip saved by PEARL.")
     if (path.parent / RECORD).exists():
         return TrainedAgent(path, json.loads((path.parent / RECORD).read_text()), path.parent)
     if env_id is None:
@@ -190,9 +212,11 @@ def agent_for(
     :raises FileNotFoundError: if there is none
     """
     methods = METHODS if method is None else (method,)
+    numbers: list[str] = []
     for name in methods:
         runs = [path.parent for path in Path(folder, name).glob(f"{env_id}_*/{RECORD}") if _number(path.parent, env_id) > 0]
         runs = sorted(runs, key=lambda run: _number(run, env_id), reverse=True)
+        numbers += [f"{_number(run, env_id)} ({name})" for run in reversed(runs)]
         for run in [run for run in runs if exp_id in (0, _number(run, env_id))]:
             # A run that has no model yet is passed over, if it was not asked for
             if exp_id or (run / "best_model.zip").exists() or (run / f"{env_id}.zip").exists():
@@ -202,6 +226,8 @@ def agent_for(
         if file.exists():
             return agent_at(file)
     wanted = f"{env_id}" + (f" run {exp_id}" if exp_id else "") + (f" by {method}" if method else "")
+    if exp_id and numbers:
+        raise FileNotFoundError(f"There is no trained agent for {wanted} in {folder}/, only runs {', '.join(numbers)}.")
     with_agent = sorted(f"{file.stem} ({file.parent.name})" for file in shipped("trained_agents").glob("*/*.zip"))
     raise FileNotFoundError(
         f"There is no trained agent for {wanted} in {folder}/: train one with `sb3-htr train --env {env_id} -f {folder}`. "

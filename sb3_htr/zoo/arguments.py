@@ -86,10 +86,16 @@ def chosen_agent(parser: argparse.ArgumentParser, args: argparse.Namespace, path
     :param args: of :func:`add_agent_arguments`
     :param path: what was given as agent, if anything
     :return: the agent; its env is registered
+    :raises ValueError: if arguments contradict each other
     """
     import_packages(args.gym_packages)
     if path is not None:
         agent = agent_at(path, args.model, args.env)
+        if args.env not in (None, agent.env_id):
+            raise ValueError(
+                f"{agent.path} was trained on {agent.env_id}, but --env is {args.env}: leave one of the two away "
+                f"(-f FOLDER --env ID looks for agents of an env)."
+            )
     elif args.env is not None:
         agent = agent_for(args.env, args.folder, args.algo, args.exp_id, args.model)
     else:

@@ -8,7 +8,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sb3_htr.zoo.intervals import iqm_interval
-from sb3_htr.zoo.plots import COLOURS, save
+from sb3_htr.zoo.plots import COLOURS, save, span_unit_if_flat
+
+# With more points than these, a curve has no markers
+MAX_MARKERS = 15
 
 
 def band(axes: plt.Axes, x: np.ndarray, scores: np.ndarray, colour: str, style: str, label: str) -> None:
@@ -23,7 +26,7 @@ def band(axes: plt.Axes, x: np.ndarray, scores: np.ndarray, colour: str, style: 
     :param label: for the legend
     """
     points = np.array([iqm_interval(column) for column in scores.T])
-    axes.plot(x, points[:, 0], style, color=colour, label=label)
+    axes.plot(x, points[:, 0], style, color=colour, label=label, marker="o" if len(x) <= MAX_MARKERS else "", markersize=4)
     axes.fill_between(x, points[:, 1], points[:, 2], color=colour, alpha=0.2, linewidth=0)
 
 
@@ -76,5 +79,8 @@ def plot_curves(curves: dict[str, Curve], path: Path, title: str, x_label: str, 
         axes.set_xlabel(x_label)
         axes.set_ylabel(y_label)
         axes.xaxis.get_major_locator().set_params(integer=True)
-    interval = any(len(curve.returns) > 1 for curve in curves.values())
-    finish(figure, path, f"{title}{': IQM over seeds, 95 % interval' if interval else ''}")
+    span_unit_if_flat(left)
+    # Of two seeds, the IQM is the mean, and its bootstrap interval their range
+    seeds = {min(len(curve.returns), 3) for curve in curves.values()}
+    shown = {3: "IQM over seeds, 95 % interval", 2: "mean and range of 2 seeds"}
+    finish(figure, path, "; ".join([title, *(text for n, text in shown.items() if n in seeds)]))

@@ -55,6 +55,8 @@ def watch(agent: TrainedAgent, args: argparse.Namespace, render_mode: str | None
     tasks: np.ndarray = getattr(get_task_family(vec_env), f"{args.tasks}_tasks")
     if args.n_episodes < 1:
         raise ValueError(f"--n-episodes is {args.n_episodes}, expected at least 1.")
+    if args.n_tasks < 1:
+        raise ValueError(f"--n-tasks is {args.n_tasks}, expected at least 1.")
     numbers = args.task or range(1, min(args.n_tasks, len(tasks)) + 1)
     wrong = [number for number in numbers if not 1 <= number <= len(tasks)]
     if wrong:
@@ -62,6 +64,8 @@ def watch(agent: TrainedAgent, args: argparse.Namespace, render_mode: str | None
     normalize = vec_env.normalize_obs if isinstance(vec_env, VecNormalize) else lambda obs: obs
     say = print if args.verbose > 0 else lambda text: None
     say(f"{agent.path}: {agent.env_id}, explorer {args.explorer or model.explorer!r}")
+    if not args.task and args.n_tasks > len(tasks):
+        say(f"There are only {len(tasks)} {args.tasks} tasks, fewer than --n-tasks {args.n_tasks}: playing all of them.")
     player = Player(model, env, normalize, args.explorer, not args.stochastic, args.seed)
     ends: list[Moment] = []
     n_steps, going_on = 0, True
@@ -120,16 +124,17 @@ def main(argv: Sequence[str]) -> None:
 
 def _open_window(agent: TrainedAgent, fps: float | None) -> "tuple[Window, Captioner] | tuple[None, None]":
     """None, and a sentence for the user, where no window can be opened."""
-    reason = "the env makes no pictures"
-    if can_be_drawn(agent):
-        try:
-            from sb3_htr.zoo.captions import Captioner
-            from sb3_htr.zoo.window import Window
+    if not can_be_drawn(agent):
+        print(f"Numbers only: {agent.env_id} cannot draw itself, 'rgb_array' is not in its metadata['render_modes'].")
+        return None, None
+    try:
+        from sb3_htr.zoo.captions import Captioner
+        from sb3_htr.zoo.window import Window
 
-            return Window(f"sb3-htr enjoy {agent.env_id}", fps or agent.make_env().metadata.get("render_fps", 30)), Captioner()
-        except ModuleNotFoundError as error:
-            reason = f"{error.name} is not installed (pip install 'sb3_htr[plots]')"
-        except (OSError, ImportError) as error:
-            reason = str(error)
+        return Window(f"sb3-htr enjoy {agent.env_id}", fps or agent.make_env().metadata.get("render_fps", 30)), Captioner()
+    except ModuleNotFoundError as error:
+        reason = f"{error.name} is not installed (pip install 'sb3_htr[plots]')"
+    except (OSError, ImportError) as error:
+        reason = str(error)
     print(f"Numbers only: {reason}. `sb3-htr record` films without a screen.")
     return None, None

@@ -9,7 +9,7 @@ from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.evaluation import AdaptationRecord, record_adaptation
 from sb3_htr.zoo.arguments import add_adaptation_arguments, add_agent_arguments, make_parser, parse
-from sb3_htr.zoo.plots import plot_adaptation_curve, plot_adaptation_paths
+from sb3_htr.zoo.plots import plot_adaptation_curve, plot_adaptation_paths, start_position
 
 EXAMPLE = """  sb3-htr evaluate logs
   sb3-htr evaluate --env SparsePointRobot-v0 --explorer prior"""
@@ -55,8 +55,10 @@ def main(argv: Sequence[str]) -> None:
     with atomic_path(output / "adaptation.npz") as path:
         np.savez_compressed(path, tasks=tasks, **record._asdict())
     pictures = [output / "adaptation_curve.png"]
-    plot_adaptation_curve(record, pictures[0], f"{agent.env_id}: {len(tasks)} {args.tasks} tasks, explorer {explorer!r}")
+    title = f"{agent.env_id}, {len(tasks)} {args.tasks} tasks, explorer {explorer}"
+    plot_adaptation_curve(record, pictures[0], title)
     if tasks.shape[1] == 2:
         pictures.append(output / "adaptation_paths.png")
-        plot_adaptation_paths(record, tasks, getattr(family, "goal_radius", None), pictures[1])
+        start, radius = start_position(agent.make_env()), getattr(family, "goal_radius", None)
+        plot_adaptation_paths(record, tasks, radius, start, pictures[1], title)
     print("Pictures: " + ", ".join(str(picture) for picture in pictures))

@@ -67,12 +67,20 @@ def push_to_hub(folder: Path, repo_id: str, private: bool = False) -> str:
     :param repo_id: ``user/name``; made if there is none
     :param private: make it private
     :return: address of the model's page
+    :raises OSError: if that fails
     """
     from huggingface_hub import HfApi
+    from huggingface_hub.errors import HfHubHTTPError
 
+    # Its bases are OSError and what the HTTP library raises, which is another one in other versions of huggingface_hub
+    failures: tuple[type[Exception], ...] = (ValueError, *HfHubHTTPError.__bases__)
     api = HfApi()
-    repo = api.create_repo(repo_id, private=private, exist_ok=True)
-    api.upload_folder(repo_id=repo.repo_id, folder_path=folder, commit_message="PEARL agent of sb3_htr")
+    try:
+        repo = api.create_repo(repo_id, private=private, exist_ok=True)
+        api.upload_folder(repo_id=repo.repo_id, folder_path=folder, commit_message="PEARL agent of sb3_htr")
+    except failures as error:
+        reason = " ".join(str(error).split())
+        raise OSError(f"The upload to {repo_id} failed, the files are in {folder}: {reason}") from error
     return str(repo)
 
 

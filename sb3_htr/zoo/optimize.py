@@ -2,6 +2,7 @@
 
 import argparse
 import importlib
+import logging
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -81,8 +82,23 @@ def main(argv: Sequence[str]) -> None:
             "--storage needs a --study-name, by which other workers and `sb3-htr train --trial-id` find the study."
         )
     study = create_study(args.storage, args.study_name) if args.storage else None
-    # Later arguments win, so this is a default
-    train.main(["-optimize", "--n-evaluations", "5", *argv])
-    if study is not None:
+    # It was said above whether the study is new; to rl_zoo3 it never is
+    logger = logging.getLogger("optuna.study.study")
+    logger.addFilter(_is_news)
+    try:
+        # Later arguments win, so this is a default
+        train.main(["-optimize", "--n-evaluations", "5", *argv])
+    finally:
+        logger.removeFilter(_is_news)
+    if study is None:
+        return
+    values = [trial.value for trial in study.get_trials(states=[optuna.trial.TrialState.COMPLETE])]
+    if not any(values):
+        print(f"No trial learnt anything: the return after adaptation is 0 in all {len(values)}. Make the trials longer (-n).")
+    else:
         where = f"--study-name {args.study_name} --storage {args.storage}"
         print(f"Train with the best trial so far: sb3-htr train --env {args.env} {where} --trial-id {study.best_trial.number}")
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    return not record.getMessage().startswith("Using an existing study")

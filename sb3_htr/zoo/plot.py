@@ -1,7 +1,8 @@
 """``sb3-htr plot``: pictures of one or several runs."""
 
 import argparse
-from collections.abc import Callable, Sequence
+import inspect
+from collections.abc import Callable, Iterable, Sequence
 from functools import reduce
 from pathlib import Path
 from typing import NamedTuple
@@ -9,17 +10,19 @@ from typing import NamedTuple
 import numpy as np
 import torch as th
 
+from sb3_htr import PEARL
 from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.evaluation import AdaptationRecord, run_adaptation
 from sb3_htr.zoo.agents import TrainedAgent, find_runs
 from sb3_htr.zoo.arguments import add_adaptation_arguments, add_agent_arguments, chosen_agent, make_parser
 from sb3_htr.zoo.curves import Curve, plot_curves
 from sb3_htr.zoo.latent import plot_latent_space
-from sb3_htr.zoo.plots import plot_adaptation_curve, plot_adaptation_paths
+from sb3_htr.zoo.plots import plot_adaptation_curve, plot_adaptation_paths, start_position
 
 EXAMPLE = """  sb3-htr plot --env SparsePointRobot-v0                  an agent that comes with the package
   sb3-htr plot runs/htr runs/sparse -l HTR "no relabelling"    the runs in a folder are the seeds of its curve
   sb3-htr plot runs --only learning -o pictures"""
+DEFAULT_EXPLORER = inspect.signature(PEARL.__init__).parameters["explorer"].default
 PICTURES = ("learning", "adaptation", "paths", "latent")
 
 
@@ -29,6 +32,8 @@ class Adapted(NamedTuple):
 
     :param tasks: (n_tasks, task_dim)
     :param goal_radius: radius of the goals, if the tasks are places with one
+    :param start: where all episodes begin, if tasks are points of a plane
+    :param explorer: that chose z before the reward was found
     :param record: what happened
     :param mean: (n_tasks, latent_dim), posterior means after the last episode
     :param deviation: (n_tasks, latent_dim), their standard deviations
@@ -38,6 +43,8 @@ class Adapted(NamedTuple):
 
     tasks: np.ndarray
     goal_radius: float | None
+    start: np.ndarray | None
+    explorer: str
     record: AdaptationRecord
     mean: np.ndarray
     deviation: np.ndarray
@@ -62,7 +69,9 @@ def adapt(agent: TrainedAgent, args: argparse.Namespace) -> Adapted:
     record = run_adaptation(model.policy, env, adaptation, args.n_episodes, deterministic=not args.stochastic)
     known_z = model.policy.latent_prior.known_tasks().z
     radius = getattr(family, "goal_radius", None)
-    return Adapted(tasks, radius, record, *adaptation.posterior(), ~adaptation.exploring(), known_z)
+    explorer = args.explorer or model.explorer
+    start = start_position(agent.make_env()) if tasks.shape[1] == 2 else None
+    return Adapted(tasks, radius, start, explorer, record, *adaptation.posterior(), ~adaptation.exploring(), known_z)
 
 
 def groups_of(parser: argparse.ArgumentParser, args: argparse.Namespace) -> dict[str, list[TrainedAgent]]:
@@ -99,6 +108,15 @@ def check_same_settings(label: str, agents: Sequence[TrainedAgent]) -> None:
         raise ValueError(
             f"The runs in {label} differ in {sorted(different)}: put them into folders of their own, one per curve."
         )
+
+
+def about_explorers(names: Iterable[str]) -> str:
+    """
+    :param names: explorer of each run
+    :return: for a title
+    """
+    different = sorted(set(names))
+    return f"explorer{'s' * (len(different) > 1)} {' and '.join(different)}"
 
 
 def learning_curve(label: str, agents: Sequence[TrainedAgent]) -> Curve | None:
@@ -144,9 +162,12 @@ def main(argv: Sequence[str]) -> None:
 
     if "learning" in args.only:
         learning = {label: curve for label, agents in groups.items() if (curve := learning_curve(label, agents)) is not None}
-        labels = ("return of the last adaptation episode", "validation tasks solved in it (%)")
+        labels = ("return of the last adaptation episode", "share of tasks solved (%)")
         if learning:
-            plot_curves(learning, new("learning_curves.png"), env_id, "thousand env steps of meta-training", labels)
+            settings = [agent.record.get("hyperparams", {}) for agents in groups.values() for agent in agents]
+            names = [setting.get("explorer", DEFAULT_EXPLORER) for setting in settings]
+            about = f"{env_id}, validation tasks, {about_explorers(names)}"
+            plot_curves(learning, new("learning_curves.png"), about, "thousand env steps of meta-training", labels)
         else:
             print("No learning curves: there is no evaluations.npz of a training.")
     if set(args.only) != {"learning"}:
@@ -163,7 +184,8 @@ def plot_adapted(args: argparse.Namespace, env_id: str, adapted: dict[str, list[
     :param new: gives the path of a picture
     """
     label, first = next((label, runs[0]) for label, runs in adapted.items())
-    about = f"{env_id}, {len(first.tasks)} {args.tasks} tasks"
+    used = about_explorers(run.explorer for runs in adapted.values() for run in runs)
+    about = f"{env_id}, {len(first.tasks)} {args.tasks} tasks, {used}"
     if "adaptation" in args.only:
         if sum(map(len, adapted.values())) == 1:
             plot_adaptation_curve(first.record, new("adaptation_curve.png"), about)
@@ -173,10 +195,11 @@ def plot_adapted(args: argparse.Namespace, env_id: str, adapted: dict[str, list[
                 returns = np.stack([run.record.returns.mean(axis=0) for run in runs])
                 successes = np.stack([run.record.successes.mean(axis=0) for run in runs])
                 curves[name] = Curve(np.arange(1, args.n_episodes + 1), returns, successes)
-            labels = ("return", "tasks solved in the episode (%)")
+            labels = ("return", "share of tasks solved (%)")
             plot_curves(curves, new("adaptation_curve.png"), about, "adaptation episode", labels)
     if "paths" in args.only and first.tasks.shape[1] == 2:
-        plot_adaptation_paths(first.record, first.tasks, first.goal_radius, new("adaptation_paths.png"))
+        title = f"{env_id}, {label}, {args.tasks} tasks, explorer {first.explorer}"
+        plot_adaptation_paths(first.record, first.tasks, first.goal_radius, first.start, new("adaptation_paths.png"), title)
     found = first.found
     if "latent" in args.only and found.sum() < 2:
         print(f"No latent space: {label} found the reward of {found.sum()} of {len(found)} tasks.")

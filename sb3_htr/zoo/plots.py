@@ -6,10 +6,12 @@ import matplotlib
 
 matplotlib.use("Agg")
 
+import gymnasium as gym
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Circle
 
+from htr_envs import Trajectory
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.evaluation import AdaptationRecord
 
@@ -28,6 +30,27 @@ def save(figure: plt.Figure, path: Path) -> None:
     plt.close(figure)
 
 
+def span_unit_if_flat(axes: plt.Axes) -> None:
+    """
+    :param axes: whose values may be all the same, as of an agent that has found nothing; a tiny range would show noise
+    """
+    low, high = axes.dataLim.intervaly
+    if low == high:
+        axes.set_ylim(min(low, 0.0) - 0.04, max(high, 1.0) + 0.04)
+
+
+def start_position(env: gym.Env) -> np.ndarray | None:
+    """
+    :param env: env of a task family whose tasks are places
+    :return: where its episodes begin (2,); None if they begin in several places
+    """
+    family, action = env.get_wrapper_attr("task_family"), env.action_space.sample()[None]
+    observations = [env.reset(seed=seed)[0][None] for seed in range(2)]
+    free = np.zeros(1, dtype=np.float32)
+    first, second = (family.hindsight_task(Trajectory(obs, action, obs, free), 0) for obs in observations)
+    return np.asarray(first) if np.array_equal(first, second) else None
+
+
 def plot_adaptation_curve(record: AdaptationRecord, path: Path, title: str) -> None:
     """
     Return and success of each adaptation episode, with the spread over tasks.
@@ -44,11 +67,12 @@ def plot_adaptation_curve(record: AdaptationRecord, path: Path, title: str) -> N
     top.plot(episodes, returns.mean(axis=0), color=BLUE, marker="o", markersize=4, label="mean over tasks")
     top.set_ylabel("return")
     top.set_title(title)
+    span_unit_if_flat(top)
     top.legend(frameon=False, loc="lower right")
     bottom.plot(episodes, 100 * successes.mean(axis=0), color=ORANGE, marker="o", markersize=4, label="in this episode")
     found = 100 * np.maximum.accumulate(successes, axis=1).mean(axis=0)
     bottom.plot(episodes, found, color=GREY, linestyle="--", label="so far")
-    bottom.set_ylabel("tasks solved (%)")
+    bottom.set_ylabel("share of tasks\nsolved (%)")
     bottom.set_ylim(-4, 104)
     bottom.set_xlabel("adaptation episode")
     bottom.set_xticks(episodes)
@@ -60,7 +84,13 @@ def plot_adaptation_curve(record: AdaptationRecord, path: Path, title: str) -> N
 
 
 def plot_adaptation_paths(
-    record: AdaptationRecord, tasks: np.ndarray, goal_radius: float | None, path: Path, n_tasks: int = 6
+    record: AdaptationRecord,
+    tasks: np.ndarray,
+    goal_radius: float | None,
+    start: np.ndarray | None,
+    path: Path,
+    title: str,
+    n_tasks: int = 6,
 ) -> None:
     """
     The ways of the adaptation episodes on the plane, for task spaces that are a plane.
@@ -68,7 +98,9 @@ def plot_adaptation_paths(
     :param record: adaptations
     :param tasks: (n, 2) goals
     :param goal_radius: radius of the goals, drawn as a point if None
+    :param start: of all episodes, see :func:`start_position`; paths begin after the first step if None
     :param path: picture to write
+    :param title: what was adapted
     :param n_tasks: number of tasks to show, evenly taken from all of them
     """
     shown = np.unique(np.linspace(0, len(tasks) - 1, n_tasks).astype(int))
@@ -76,7 +108,7 @@ def plot_adaptation_paths(
     columns = min(3, len(order))
     rows = -(-len(order) // columns)
     figure, grid = plt.subplots(
-        rows, columns, figsize=(3.1 * columns, 2.1 * rows + 0.5), squeeze=False, sharex=True, sharey=True, layout="constrained"
+        rows, columns, figsize=(3.1 * columns, 2.3 * rows + 0.8), squeeze=False, sharex=True, sharey=True, layout="constrained"
     )
     for axes in grid.flat[len(order) :]:
         axes.set_visible(False)
@@ -84,14 +116,16 @@ def plot_adaptation_paths(
         successes = record.successes[task]
         first = int(successes.argmax()) if successes.any() else len(successes)
         axes.add_patch(Circle(tasks[task], goal_radius or 0.03, facecolor=GREEN, alpha=0.35, edgecolor=GREEN))
-        for episode, way in enumerate(record.achieved[task]):
-            # A step's achieved task is where it led; the start is not part of it
+        # A step's achieved task is where it led; the start is not part of it
+        ways = record.achieved[task]
+        if start is not None:
+            ways = np.concatenate([np.broadcast_to(start, (len(ways), 1, 2)), ways], axis=1)
+        for episode, way in enumerate(ways):
             line = {"color": GREY, "alpha": 0.8, "linewidth": 1.0} if episode < first else {"color": BLUE, "linewidth": 1.2}
             axes.plot(way[:, 0], way[:, 1], **line)
-        last = record.achieved[task, -1]
-        axes.plot(last[:, 0], last[:, 1], color=ORANGE, linewidth=2)
+        axes.plot(ways[-1, :, 0], ways[-1, :, 1], color=ORANGE, linewidth=2)
         text = f"solved in episode {first + 1}" if successes.any() else "not solved"
-        axes.set_title(f"{text}, last return {record.returns[task, -1]:.1f}", fontsize=9)
+        axes.set_title(f"task {task + 1}: {text},\nlast return {record.returns[task, -1]:.1f}", fontsize=9)
         axes.set_aspect("equal")
         axes.spines[["top", "right"]].set_visible(False)
     handles = [
@@ -101,6 +135,7 @@ def plot_adaptation_paths(
         plt.Line2D([], [], color=GREEN, marker="o", linestyle="", alpha=0.5, markersize=9, label="hidden goal"),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
+    figure.suptitle(title, fontsize=11)
     for axes in grid[-1]:
         axes.set_xlabel("x (length)")
     for axes in grid[:, 0]:

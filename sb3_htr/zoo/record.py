@@ -87,7 +87,7 @@ def main(argv: Sequence[str]) -> None:
     if args.every < 1 or not args.speed > 0:
         raise ValueError(f"--every is {args.every} and --speed {args.speed}, expected at least 1 and more than 0.")
     if not can_be_drawn(agent):
-        raise ValueError(f"{agent.env_id} makes no pictures: it has no render mode 'rgb_array'.")
+        raise ValueError(f"{agent.env_id} cannot be filmed: 'rgb_array' is not in its metadata['render_modes'].")
     fps = agent.make_env().metadata.get("render_fps", 30) * args.speed / args.every
     captioner = Captioner()
     with atomic_path(output) as temporary:
