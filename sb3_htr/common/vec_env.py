@@ -3,6 +3,7 @@
 import importlib
 import os
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -120,7 +121,9 @@ def make_task_vec_env(
         importlib.import_module(module)
     spec = gym.spec(env_id)
     if spec.vector_entry_point is None:
-        return make_vec_env(env_id, n_envs, seed=seed, monitor_dir=monitor_dir, env_kwargs=env_kwargs)
+        # By its id, SB3 would ask for a render mode, which an env need not have
+        make = partial(gym.make, env_id)
+        return make_vec_env(make, n_envs, seed=seed, monitor_dir=monitor_dir, env_kwargs=env_kwargs)
     vector_env = gym.make_vec(env_id, n_envs, vectorization_mode="vector_entry_point", **(env_kwargs or {}))
     check_has_task_family(hasattr(vector_env, "task_family"))
     monitor_file = None if monitor_dir is None else os.path.join(monitor_dir, "0.monitor.csv")

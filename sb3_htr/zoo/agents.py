@@ -13,7 +13,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
-from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
@@ -92,9 +91,6 @@ class TrainedAgent:
         :param n_envs: number of envs
         :return: the envs, in the VecNormalize of the training if that had one
         """
-        if gym.spec(self.env_id).vector_entry_point is None:
-            # By its id, SB3 would ask for a render mode that it may not have
-            return self.normalized(make_vec_env(self.make_env, n_envs))
         return self.normalized(make_task_vec_env(self.env_id, n_envs, env_kwargs=self.record["env_kwargs"]))
 
     def normalized(self, env: VecEnv) -> VecEnv:
