@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from sb3_htr import PEARL
 from sb3_htr.common.evaluation import AdaptationRecord
-from sb3_htr.zoo import curves, plots
+from sb3_htr.zoo import curves, intervals, plots
 from sb3_htr.zoo.cli import main
 
 
@@ -74,7 +74,7 @@ def test_paths_begin_at_the_start_and_name_their_task(drawn: list[Figure]) -> No
 
 
 def test_curves_say_what_they_show(drawn: list[Figure], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sb3_htr.zoo.intervals.REPS", 200)
+    monkeypatch.setattr(intervals, "REPS", 200)
     for n_seeds, n_points, said in (
         (1, 16, "env"),
         (2, 15, "env; mean and range of 2 seeds"),
