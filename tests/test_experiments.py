@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from sb3_htr.experiments import (
-    ant_settings,
     goal_distance,
     locomotion,
     point_robot,
@@ -34,7 +33,6 @@ EXPERIMENTS: dict[str, tuple[Callable[[int, int], list[Cell]], Plot]] = {
     "target_speed": (target_speed.cells, report.plot_learning),
     "precision": (precision.cells, report.plot_learning),
     "wheeled": (partial(locomotion.cells, "SparseWheeled-v0"), report.plot_learning),
-    "ant_settings": (ant_settings.cells, report.plot_learning),
     "ant": (partial(locomotion.cells, "SparseAnt-v0"), report.plot_learning),
 }
 

@@ -44,6 +44,7 @@ def test_train_writes_a_run_folder(runs: Path) -> None:
     settings = json.loads((run / "run.json").read_text())
     assert settings["env_id"] == ENV_ID and settings["seed"] == 1 and "torch" in settings["versions"]
     assert settings["hyperparams"]["n_tasks_per_rollout"] == 4
+    assert settings["hyperparams"]["n_timesteps"] == 960, "as used, not as in the YAML file"
     assert (run / ENV_ID / "config.yml").exists() and list(runs.glob("tb/**/events*"))
     assert np.load(run / "evaluations.npz")["timesteps"].tolist() == [480, 960]
     assert len((run / "0.monitor.csv").read_text().splitlines()) == 2 + 960 / 20

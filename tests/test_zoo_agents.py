@@ -360,14 +360,6 @@ def test_captions_know_what_was_worst(tmp_path: Path) -> None:
     assert dark[1] < dark[0], "the bar of the uncertainty is shorter"
 
 
-def test_the_card_says_how_long_the_training_was() -> None:
-    record = {"env_id": ENV_ID, "env_kwargs": {}, "gym_packages": [], "seed": 1, "num_timesteps": 8000, "model": "last"}
-    record |= {"n_timesteps": 8000, "hyperparams": {"n_timesteps": 150000.0, "gamma": 0.9}}
-    scores = {"search": AdaptationRecord(np.ones((2, 7)), np.ones((2, 7), dtype=bool), np.zeros((2, 7, 1, 1)))}
-    card = model_card.model_card(record, scores)
-    assert "n_timesteps: 8000\n" in card and "150000" not in card and "gamma: 0.9" in card
-
-
 def test_tables_show_the_last_episode() -> None:
     record = AdaptationRecord(np.ones((2, 7)), np.ones((2, 7), dtype=bool), np.zeros((2, 7, 1, 1), dtype=np.float32))
     assert [line.split()[1] for line in model_card.table({"search": record}).splitlines()[2:]] == ["1", "2", "3", "5", "7"]

@@ -102,10 +102,6 @@ def model_card(record: dict[str, Any], scores: dict[str, AdaptationRecord], repo
         imports += "from huggingface_hub import hf_hub_download\n"
         path = f'hf_hub_download("{repo_id}", {path})'
     about = " with Hindsight Task Relabelling (Packer, Abbeel and Gonzalez, 2021)" if name.startswith("htr") else ""
-    hyperparams = dict(record.get("hyperparams", {}))
-    if "n_timesteps" in record:
-        # -n wins over the YAML file
-        hyperparams["n_timesteps"] = record["n_timesteps"]
     versions = ", ".join(f"{package} {version}" for package, version in record.get("versions", {}).items())
     return f"""---
 {data.to_yaml()}
@@ -154,6 +150,6 @@ $ {record.get("command", "unknown")}
 The model after {record["num_timesteps"]:,} env steps ({record["model"]}). {versions}.
 
 ```yaml
-{yaml.safe_dump(hyperparams, sort_keys=True).strip()}
+{yaml.safe_dump(record.get("hyperparams", {}), sort_keys=True).strip()}
 ```
 """
