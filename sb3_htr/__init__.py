@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from sb3_htr.common.evaluation import evaluate_adaptation
+from sb3_htr.adaptation.evaluation import evaluate_adaptation
 from sb3_htr.htr import MultiTaskReplayBuffer
 from sb3_htr.pearl import PEARL, load_untrusted
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_htr.common.type_aliases import TaskFamily
 
@@ -118,19 +118,16 @@ def get_max_episode_steps(env: VecEnv) -> int:
     return int(limit)
 
 
-def check_reward_is_not_normalized(env: VecEnv) -> VecNormalize | None:
+def check_is_not_normalized(env: VecEnv) -> None:
     """
     :param env: env to train on
-    :return: its VecNormalize wrapper, if there is one
-    :raises ValueError: if that rescales rewards
+    :raises ValueError: if it is in SB3's VecNormalize
     """
-    normalize = unwrap_vec_normalize(env)
-    if normalize is not None and normalize.norm_reward:
+    if unwrap_vec_normalize(env) is not None:
         raise ValueError(
-            "VecNormalize rescales rewards, which mixes the scales of all tasks and disagrees with relabelled rewards: "
-            "pass norm_reward=False."
+            "VecNormalize stands between the env and relabelled rewards, and is not saved with the model: leave it away and "
+            "pass policy_kwargs={'normalize_observations': True}. Rewards cannot be normalized: all tasks share one scale."
         )
-    return normalize
 
 
 def check_task_ids(env: VecEnv) -> None:

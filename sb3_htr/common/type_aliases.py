@@ -46,14 +46,29 @@ class TaskFamily(Protocol):
         ...
 
 
+class Context(NamedTuple):
+    """
+    Transitions of M tasks, those of the first task first: what a posterior is inferred from. All float32.
+
+    :param observations: (n, obs_dim)
+    :param actions: (n, action_dim), scaled to [-1, 1]
+    :param rewards: (n,)
+    :param lengths: (M,) int64, how many of these transitions are of each task
+    """
+
+    observations: th.Tensor
+    actions: th.Tensor
+    rewards: th.Tensor
+    lengths: th.Tensor
+
+
 class MultiTaskSamples(NamedTuple):
     """
-    One meta-batch of M tasks: n transitions for the context and N for actor and critics, those of the first task first.
+    One meta-batch of M tasks: a context, and N transitions for actor and critics, those of the first task first.
 
     All tensors are on the buffer's device, and float32, unless said otherwise.
 
-    :param context: (n, obs_dim + action_dim + 1), rows (o, a, r)
-    :param context_lengths: (M,) int64, how many rows of the context are of each task, at least 1
+    :param context: of at least one transition of each task
     :param observations: (N, obs_dim)
     :param actions: (N, action_dim), scaled to [-1, 1]
     :param next_observations: (N, obs_dim)
@@ -65,8 +80,7 @@ class MultiTaskSamples(NamedTuple):
     :param unrewarded: (M,) bool array, whether no reward of the RL batch has a part that depends on the task
     """
 
-    context: th.Tensor
-    context_lengths: th.Tensor
+    context: Context
     observations: th.Tensor
     actions: th.Tensor
     next_observations: th.Tensor

@@ -1,5 +1,4 @@
-from sb3_htr.htr.episode_clustering import EpisodeClustering
-from sb3_htr.htr.hindsight_task import HindsightTaskStrategy
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
+from sb3_htr.htr.relabel import EpisodeClustering, HindsightTaskStrategy, Relabeller, SingleEpisodeRelabelling
 
-__all__ = ["EpisodeClustering", "HindsightTaskStrategy", "MultiTaskReplayBuffer"]
+__all__ = ["EpisodeClustering", "HindsightTaskStrategy", "MultiTaskReplayBuffer", "Relabeller", "SingleEpisodeRelabelling"]

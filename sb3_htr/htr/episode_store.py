@@ -25,6 +25,22 @@ class EpisodeIndex(NamedTuple):
     task_row: np.ndarray
     tasks: np.ndarray
 
+    def latest_episodes(self, tasks: np.ndarray, n_episodes: int) -> np.ndarray:
+        """
+        :param tasks: (m,) int
+        :param n_episodes: how many of each task's newest episodes, at most
+        :return: (m, 2) int, their virtual rows as half-open ranges
+        """
+        first, end = self.task_episode[tasks], self.task_episode[tasks + 1]
+        return self.episode_row[np.stack([np.maximum(end - n_episodes, first), end], axis=1)]
+
+    def all_episodes(self, tasks: np.ndarray) -> np.ndarray:
+        """
+        :param tasks: (m,) int
+        :return: (m, 2) int, the virtual rows of each task as half-open ranges
+        """
+        return np.stack([self.task_row[tasks], self.task_row[tasks + 1]], axis=1)
+
 
 class EpisodeStore:
     """
@@ -47,13 +63,18 @@ class EpisodeStore:
         self._lengths = np.zeros(0, dtype=np.int64)
         self._data = np.zeros((0, episode_length, row_dim), dtype=np.float32)
         self._index: EpisodeIndex | None = None
-        self._n_first_tasks = n_tasks
-        self._new: list[int] = []
 
     @property
     def rows(self) -> np.ndarray:
         """All slots as (n_slots * episode_length, row_dim); see :class:`EpisodeIndex` for the rows that hold data."""
         return self._data.reshape(-1, self._data.shape[-1])
+
+    def take(self, virtual: np.ndarray) -> np.ndarray:
+        """
+        :param virtual: (n,) int, virtual rows, see :class:`EpisodeIndex`
+        :return: (n, row_dim) float32, copies of these transitions
+        """
+        return self.rows.take(self.index().rows.take(virtual), axis=0)
 
     @property
     def n_tasks(self) -> int:
@@ -80,32 +101,17 @@ class EpisodeStore:
         self._lengths[slot] = len(episode)
         self.n_added[task] += 1
         self._index = None
-        if task < self._n_first_tasks:
-            self._new.append(slot)
 
     def add_task(self) -> int:
         """
         :return: index of a new task, without episodes
         """
         if self.n_tasks == len(self._slots):
-            self._slots = np.concatenate([self._slots, np.full_like(self._slots, -1)])
+            more = np.full((max(self.n_tasks, 1), self.episodes_per_task), -1, dtype=np.int64)
+            self._slots = np.concatenate([self._slots, more])
         self.n_added = np.append(self.n_added, 0)
         self._index = None
         return self.n_tasks - 1
-
-    def take_new(self) -> tuple[np.ndarray, np.ndarray]:
-        """
-        :return: the episodes added since the last call (n, episode_length, row_dim), and their lengths (n,); rows beyond an
-            episode's length hold anything. Episodes of tasks that were added later are copies, and left out
-        """
-        # A slot that was overwritten since is listed twice
-        slots = np.unique(np.array(self._new, dtype=np.int64))
-        self._new = []
-        return self._data[slots], self._lengths[slots]
-
-    def forget_taken(self) -> None:
-        """Let :meth:`take_new` return every stored episode again."""
-        self._new = self._slots[: self._n_first_tasks][self._slots[: self._n_first_tasks] >= 0].tolist()
 
     def state_dict(self) -> dict[str, Any]:
         """
@@ -116,7 +122,6 @@ class EpisodeStore:
             "slots": self._slots[: self.n_tasks],
             "lengths": self._lengths[: self._n_slots],
             "data": self._data[: self._n_slots],
-            "new": np.array(self._new, dtype=np.int64),
         }
         return {**{name: th.tensor(array) for name, array in arrays.items()}, "capacity": th.tensor(len(self._data))}
 
@@ -135,7 +140,6 @@ class EpisodeStore:
         free = int(arrays["capacity"]) - self._n_slots
         self._lengths = np.pad(arrays["lengths"], (0, free))
         self._data = np.pad(arrays["data"], ((0, free), (0, 0), (0, 0)))
-        self._new = arrays["new"].tolist()
         self._index = None
 
     def _allocate(self) -> int:

@@ -1,21 +1,21 @@
-"""Task-indexed replay with Single Episode Relabelling (SER) at sample time."""
+"""Task-indexed replay with hindsight task relabelling at sample time."""
 
+import copy
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
-from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_htr.common.checks import check_numbers
 from sb3_htr.common.random_state import get_generator_state, set_generator_state
-from sb3_htr.common.type_aliases import MultiTaskSamples, TaskFamily, Trajectory
-from sb3_htr.htr.episode_store import EpisodeIndex, EpisodeStore
-from sb3_htr.htr.hindsight_task import HindsightTaskStrategy, choose_rare, select_step, to_hindsight_task_strategy
-
-# Rows that candidates for hindsight tasks are compared with: enough to tell common from rare, in linear time
-MAX_COMPARED = 64
+from sb3_htr.common.settings import make
+from sb3_htr.common.type_aliases import Context, MultiTaskSamples, TaskFamily
+from sb3_htr.htr.episode_store import EpisodeStore
+from sb3_htr.htr.relabel import RELABELLERS, Relabeller
+from sb3_htr.htr.transitions import Transitions
 
 
 def spread(rng: np.random.Generator, ranges: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -52,10 +52,10 @@ class MultiTaskReplayBuffer(ReplayBuffer):
 
     A transition's task is ``infos[i]["task_id"]``; an episode becomes visible to :meth:`sample` when it is complete.
 
-    Single Episode Relabelling (HTR paper, B.2): with probability K, a row of the meta-batch takes ONE episode of its task's
-    replay, ONE hindsight task that this episode reached, and both context and RL batch are steps of that episode with the
-    rewards of that task. (Algorithm 2, line 12 of the paper has the comparison with K inverted; A.2 and B.3 call K the
-    probability of relabelling, which is what it is here.)
+    With probability K, a row of the meta-batch is what the relabeller makes of its task's experience, by default by Single
+    Episode Relabelling (HTR paper, B.2): context and RL batch are steps of one episode with the rewards of a task that this
+    episode reached. (Algorithm 2, line 12 of the paper has the comparison with K inverted; A.2 and B.3 call K the probability
+    of relabelling, which is what it is here.)
 
     :param buffer_size: capacity in transitions, shared equally by all training tasks
     :param observation_space: Box
@@ -67,20 +67,14 @@ class MultiTaskReplayBuffer(ReplayBuffer):
     :param max_episode_steps: time limit of the env
     :param relabel_probability: K, in [0, 1]. K = 0 is plain PEARL, bit for bit. The default was chosen by measurement
         (the paper sweeps .1 to 1 and does not name its best)
-    :param hindsight_task_strategy: which state of an episode is the hindsight task. ``"random"``: any; ``"final"``: the last;
-        ``"even"`` (default): any, those that few others resemble being more probable. The paper says "e.g., select a state
-        reached"; the default is our choice, by measurement
-    :param rl_batch_source: ``"episode"`` (B.2, default) draws the RL batch of a relabelled row from the same episode as its
-        context; ``"task"`` is the ablation of B.2, the RL batch comes from all of the task's replay
+    :param relabeller: a :class:`Relabeller`, its name, or its name and settings,
+        ``{"name": "EpisodeClustering", "cell_size": 0.2}``
     :param rl_reward_type: ``"sparse"``, or ``"dense"`` for the oracle baseline: RL batches carry the dense proxy reward of
         their task while the context stays sparse
     :param context_episodes: without relabelling, the context is drawn from this many latest episodes of the task (PEARL
         draws context from recently collected data)
     :param seed: seed of the buffer's own random generators
     """
-
-    # Whether rewards of hindsight tasks are computed when they are drawn ("lazy"), or are stored ("eager")
-    relabels_at_sample_time = True
 
     def __init__(
         self,
@@ -94,8 +88,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         task_family: TaskFamily,
         max_episode_steps: int,
         relabel_probability: float = 0.8,
-        hindsight_task_strategy: HindsightTaskStrategy | str = "even",
-        rl_batch_source: str = "episode",
+        relabeller: Relabeller | Mapping[str, Any] | str = "SingleEpisodeRelabelling",
         rl_reward_type: str = "sparse",
         context_episodes: int = 10,
         seed: int | None = None,
@@ -105,8 +98,6 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             context_episodes=(context_episodes, 1, float("inf")),
             buffer_size=(buffer_size, 1, float("inf")),
         )
-        if rl_batch_source not in ("episode", "task"):
-            raise ValueError(f'rl_batch_source is {rl_batch_source!r}, expected "episode" or "task".')
         if rl_reward_type not in ("sparse", "dense"):
             raise ValueError(f'rl_reward_type is {rl_reward_type!r}, expected "sparse" or "dense".')
         if optimize_memory_usage:
@@ -125,28 +116,26 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         self.task_family = task_family
         self.max_episode_steps = max_episode_steps
         self.relabel_probability = relabel_probability
-        self.hindsight_task_strategy = to_hindsight_task_strategy(hindsight_task_strategy)
-        self.rl_batch_source = rl_batch_source
         self.rl_reward_type = rl_reward_type
         self.context_episodes = context_episodes
-        self.obs_dim = int(np.prod(observation_space.shape or ()))
-        # Columns of a transition. (o, a, r) come first: they are what the context encoder sees.
-        o, a = self.obs_dim, self.action_dim
-        self._obs, self._action, self._reward = slice(0, o), slice(o, o + a), o + a
-        self._next_obs = slice(o + a + 1, 2 * o + a + 1)
-        self._task_free_reward, self._done = 2 * o + a + 1, 2 * o + a + 2
-        self.episodes = EpisodeStore(n_tasks, episodes_per_task, max_episode_steps, 2 * o + a + 3)
-        self._open = np.zeros((n_envs, max_episode_steps, 2 * o + a + 3), dtype=np.float32)
+        self.transitions = Transitions(observation_space, action_space)
+        self.episodes = EpisodeStore(n_tasks, episodes_per_task, max_episode_steps, self.transitions.width)
+        self._open = np.zeros((n_envs, max_episode_steps, self.transitions.width), dtype=np.float32)
         self._open_length = np.zeros(n_envs, dtype=np.int64)
         self._open_task = np.full(n_envs, -1, dtype=np.int64)
         self.seed(seed)
+        # A copy: what the user gave holds settings, and can be given to another buffer
+        self.relabeller = copy.copy(make("relabeller", relabeller, RELABELLERS, Relabeller))
+        self.relabeller.bind(self)
+        # Told of every finished episode: the training task that it was collected on, and its transitions
+        self.episode_listeners: list[Callable[[int, np.ndarray], None]] = [self.relabeller.on_episode]
 
     def seed(self, seed: int | None) -> None:
         """
         :param seed: seed of the two generators. Relabelling has its own, so that K = 0 changes nothing else.
         """
         sequence = np.random.SeedSequence(seed)
-        self._rng, self._relabel_rng = (np.random.default_rng(child) for child in sequence.spawn(2))
+        self._rng, self.relabel_rng = (np.random.default_rng(child) for child in sequence.spawn(2))
 
     @property
     def n_tasks(self) -> int:
@@ -156,24 +145,20 @@ class MultiTaskReplayBuffer(ReplayBuffer):
     @property
     def n_episodes(self) -> np.ndarray:
         """(n_tasks,) int, complete episodes stored for each training task."""
-        return np.diff(self.episodes.index().task_episode)[: self.n_tasks]
-
-    @property
-    def context_dim(self) -> int:
-        """Length of a context row (o, a, r), the first columns of a stored transition."""
-        return self._reward + 1
+        return np.diff(self.episodes.index().task_episode)
 
     def size(self) -> int:
         """
         :return: number of stored transitions, unfinished episodes not counted
         """
-        return int(self.episodes.index().task_row[self.n_tasks])
+        return len(self.episodes.index().rows)
 
     def stats(self) -> dict[str, float]:
         """
         :return: what is worth logging, by its key
         """
-        return {"replay/transitions": self.size(), "replay/megabytes": self.episodes.nbytes / 1e6}
+        own = {"replay/transitions": self.size(), "replay/megabytes": self.episodes.nbytes / 1e6}
+        return {**own, **self.relabeller.stats()}
 
     def add(
         self,
@@ -211,32 +196,28 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             )
         if (step >= self.max_episode_steps).any():
             raise ValueError(f"An episode is longer than the env's time limit of {self.max_episode_steps} steps.")
-        self._open[env, step, self._obs] = np.reshape(obs, (self.n_envs, -1))
-        self._open[env, step, self._action] = np.reshape(action, (self.n_envs, -1))
-        self._open[env, step, self._reward] = reward
-        self._open[env, step, self._next_obs] = np.reshape(next_obs, (self.n_envs, -1))
-        self._open[env, step, self._task_free_reward] = [info.get("task_free_reward", 0.0) for info in infos]
-        self._open[env, step, self._done] = done & ~timeout
+        columns = self.transitions
+        self._open[env, step, columns.observation] = np.reshape(obs, (self.n_envs, -1))
+        self._open[env, step, columns.action] = np.reshape(action, (self.n_envs, -1))
+        self._open[env, step, columns.reward] = reward
+        self._open[env, step, columns.next_observation] = np.reshape(next_obs, (self.n_envs, -1))
+        self._open[env, step, columns.task_free_reward] = [info.get("task_free_reward", 0.0) for info in infos]
+        self._open[env, step, columns.done] = done & ~timeout
         if not np.isfinite(self._open[env, step]).all():
             self._raise_not_finite(self._open[env, step], task)
         self._open_task = task
         self._open_length = step + 1
         for ended in np.flatnonzero(done):
-            self._end_episode(int(task[ended]), self._open[ended, : self._open_length[ended]])
+            episode = self._open[ended, : self._open_length[ended]]
+            self.episodes.add(int(task[ended]), episode)
+            for listener in self.episode_listeners:
+                listener(int(task[ended]), episode)
             self._open_length[ended] = 0
-
-    def _end_episode(self, task: int, episode: np.ndarray) -> None:
-        self.episodes.add(task, episode)
 
     def _raise_not_finite(self, rows: np.ndarray, task: np.ndarray) -> None:
         i = int((~np.isfinite(rows)).any(axis=1).argmax())
-        columns: dict[str, slice | int] = {
-            "observation": self._obs,
-            "action": self._action,
-            "reward": self._reward,
-            "next observation": self._next_obs,
-            "task_free_reward": self._task_free_reward,
-        }
+        names = ("observation", "action", "reward", "next_observation", "task_free_reward")
+        columns: dict[str, slice | int] = {name: getattr(self.transitions, name) for name in names}
         name = next(name for name, column in columns.items() if not np.isfinite(rows[i, column]).all())
         raise ValueError(f"The {name} of task {task[i]} (env {i}) is {rows[i, columns[name]]}, expected finite numbers.")
 
@@ -245,11 +226,11 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         :raises ValueError: if the reward hook disagrees with what the env gave for the stored episodes
         """
         index = self.episodes.index()
-        rows = self.episodes.rows[index.rows[: self.size()]]
-        task = np.repeat(np.arange(self.n_tasks), np.diff(index.task_row[: self.n_tasks + 1]))
-        traj = self.trajectory(rows[:, None])
+        rows = self.episodes.rows[index.rows]
+        task = np.repeat(np.arange(self.n_tasks), np.diff(index.task_row))
+        traj = self.transitions.trajectory(rows[:, None])
         computed = self.task_family.compute_reward(traj, self.task_family.train_tasks[task])[:, 0]
-        given = rows[:, self._reward]
+        given = rows[:, self.transitions.reward]
         wrong = ~np.isclose(given, computed, rtol=1e-4, atol=1e-4)
         if wrong.any():
             i = int(wrong.argmax())
@@ -265,7 +246,8 @@ class MultiTaskReplayBuffer(ReplayBuffer):
     def reset(self) -> None:
         """Remove all episodes."""
         store = self.episodes
-        self.episodes = EpisodeStore(self.n_tasks, store.episodes_per_task, store.episode_length, store.rows.shape[1])
+        self.episodes = EpisodeStore(self.n_tasks, store.episodes_per_task, store.episode_length, self.transitions.width)
+        self.relabeller.reset()
         self.discard_open_episodes()
 
     def state_dict(self) -> dict[str, Any]:
@@ -274,7 +256,8 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         """
         return {
             "episodes": self.episodes.state_dict(),
-            "random": [get_generator_state(generator) for generator in (self._rng, self._relabel_rng)],
+            "relabeller": self.relabeller.state_dict(),
+            "random": [get_generator_state(generator) for generator in (self._rng, self.relabel_rng)],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -282,35 +265,13 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         :param state: of :meth:`state_dict` of a buffer with the same settings
         """
         self.episodes.load_state_dict(state["episodes"])
-        for generator, saved in zip((self._rng, self._relabel_rng), state["random"], strict=True):
+        self.relabeller.load_state_dict(state["relabeller"])
+        for generator, saved in zip((self._rng, self.relabel_rng), state["random"], strict=True):
             set_generator_state(generator, saved)
         self.discard_open_episodes()
 
-    def trajectory(self, rows: np.ndarray) -> Trajectory:
-        """
-        :param rows: (..., T, row_dim) stored transitions
-        :return: what the reward hook needs of them
-        """
-        return Trajectory(
-            observations=rows[..., self._obs],
-            actions=self._unscale(rows[..., self._action]),
-            next_observations=rows[..., self._next_obs],
-            task_free_reward=rows[..., self._task_free_reward],
-        )
-
-    def _unscale(self, action: np.ndarray) -> np.ndarray:
-        low, high = self.action_space.low.ravel(), self.action_space.high.ravel()  # type: ignore[attr-defined]
-        if (low == -1).all() and (high == 1).all():
-            return action
-        return low + 0.5 * (action + 1.0) * (high - low)
-
     def sample(  # type: ignore[override]
-        self,
-        batch_size: int,
-        env: VecNormalize | None = None,
-        *,
-        meta_batch_size: int = 16,
-        context_size: int = 64,
+        self, batch_size: int, *, meta_batch_size: int = 16, context_size: int = 64
     ) -> MultiTaskSamples:
         """
         Draw a meta-batch: tasks with replacement (as PEARL's reference does), and for each of them context and RL batch.
@@ -319,88 +280,79 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         for, it is all of them. A loss that weighs tasks equally has the same expectation as with duplicates, for less work.
 
         :param batch_size: transitions per task for actor and critics, at most
-        :param env: normalizes observations, if given
         :param meta_batch_size: number of tasks, M
         :param context_size: transitions per task for the context, at most
         :return: the meta-batch
         :raises ValueError: if no episode is complete yet, or the reward hook returns NaN or infinity
         """
         index = self.episodes.index()
-        collected = index.tasks[index.tasks < self.n_tasks]
-        if len(collected) == 0:
+        if len(index.tasks) == 0:
             raise ValueError("The replay buffer holds no complete episode of any task: collect some before sampling.")
-        tasks = collected[self._rng.integers(len(collected), size=meta_batch_size)]
-        sources = self._task_sources(index, tasks)
-        relabelled = self._draw_relabelled(meta_batch_size)
+        tasks = index.tasks[self._rng.integers(len(index.tasks), size=meta_batch_size)]
+        context_source, batch_source = index.latest_episodes(tasks, self.context_episodes), index.all_episodes(tasks)
         reward_task = self.task_family.train_tasks[tasks]
-        if relabelled.any():
-            sources[:, relabelled], reward_task[relabelled] = self._draw_hindsight(index, tasks[relabelled])
-        context, n_context = spread(self._rng, sources[0], context_size)
-        batch, n_batch = spread(self._rng, sources[1], batch_size)
-        rows = self.episodes.rows.take(index.rows.take(np.concatenate([context, batch])), axis=0)
+        relabelled = self.relabel_rng.random(meta_batch_size) < self.relabel_probability
+        hindsight = self.relabeller.draw(tasks[relabelled]) if relabelled.any() else None
+        if hindsight is not None:
+            context_source[relabelled], batch_source[relabelled] = hindsight.context, hindsight.batch
+            reward_task[relabelled] = hindsight.tasks
+        context, n_context = spread(self._rng, context_source, context_size)
+        batch, n_batch = spread(self._rng, batch_source, batch_size)
+        virtual = np.concatenate([context, batch])
         task_of_row = np.concatenate([np.repeat(np.arange(meta_batch_size), n) for n in (n_context, n_batch)])
-        if self.relabels_at_sample_time and relabelled.any():
-            where = np.flatnonzero(relabelled[task_of_row])
-            self._write_rewards(rows, where, reward_task[task_of_row[where]], "sparse")
+        if hindsight is None:
+            rows = self.episodes.take(virtual)
+        else:
+            is_hindsight = relabelled[task_of_row]
+            rows = self._take(virtual, is_hindsight, hindsight.store)
+            if not hindsight.is_relabelled:
+                where = np.flatnonzero(is_hindsight)
+                self.write_rewards(rows, where, reward_task[task_of_row[where]])
         if self.rl_reward_type == "dense":
             where = np.arange(len(context), len(rows))
-            self._write_rewards(rows, where, reward_task[task_of_row[where]], "dense")
-        if env is not None:
-            for column in (self._obs, self._next_obs):
-                rows[:, column] = env.normalize_obs(rows[:, column])
+            self.write_rewards(rows, where, reward_task[task_of_row[where]], "dense")
+        columns = self.transitions
         data = self.to_torch(rows, copy=False)
         context_rows, rl_rows = data[: len(context)], data[len(context) :]
-        unrewarded = rows[len(context) :, self._reward] == rows[len(context) :, self._task_free_reward]
+        unrewarded = rows[len(context) :, columns.reward] == rows[len(context) :, columns.task_free_reward]
         return MultiTaskSamples(
-            context=context_rows[:, : self.context_dim],
-            context_lengths=self.to_torch(n_context, copy=False),
-            observations=rl_rows[:, self._obs],
-            actions=rl_rows[:, self._action],
-            next_observations=rl_rows[:, self._next_obs],
-            rewards=rl_rows[:, self._reward],
-            dones=rl_rows[:, self._done],
+            context=Context(
+                observations=context_rows[:, columns.observation],
+                actions=context_rows[:, columns.action],
+                rewards=context_rows[:, columns.reward],
+                lengths=self.to_torch(n_context, copy=False),
+            ),
+            observations=rl_rows[:, columns.observation],
+            actions=rl_rows[:, columns.action],
+            next_observations=rl_rows[:, columns.next_observation],
+            rewards=rl_rows[:, columns.reward],
+            dones=rl_rows[:, columns.done],
             lengths=self.to_torch(n_batch, copy=False),
             task_ids=tasks,
             relabelled=relabelled,
             unrewarded=np.logical_and.reduceat(unrewarded, np.cumsum(n_batch) - n_batch),
         )
 
-    def _draw_relabelled(self, meta_batch_size: int) -> np.ndarray:
-        """(M,) bool, which rows of the meta-batch are relabelled."""
-        return self._relabel_rng.random(meta_batch_size) < self.relabel_probability
+    def _take(self, virtual: np.ndarray, is_hindsight: np.ndarray, store: EpisodeStore) -> np.ndarray:
+        """(n, width), copies of virtual rows, some of which are of another store than the buffer's own."""
+        if store is self.episodes:
+            return self.episodes.take(virtual)
+        rows = np.empty((len(virtual), self.transitions.width), dtype=np.float32)
+        rows[~is_hindsight], rows[is_hindsight] = self.episodes.take(virtual[~is_hindsight]), store.take(virtual[is_hindsight])
+        return rows
 
-    def _task_sources(self, index: EpisodeIndex, tasks: np.ndarray) -> np.ndarray:
-        """As PEARL: where context and RL batch come from, the latest episodes and all of a task's replay. (2, M, 2) rows."""
-        first, end = index.task_episode[tasks], index.task_episode[tasks + 1]
-        latest = np.maximum(end - self.context_episodes, first)
-        return np.stack([index.episode_row[np.stack([start, end], axis=1)] for start in (latest, first)])
+    def write_rewards(self, rows: np.ndarray, where: np.ndarray, tasks: np.ndarray, reward_type: str = "sparse") -> None:
+        """
+        Give ``rows[where]`` the rewards of ``tasks``, in one call of the reward hook.
 
-    def _draw_hindsight(self, index: EpisodeIndex, tasks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """SER: one episode, the source of context and RL batch, and one hindsight task that it reached."""
-        rng = self._relabel_rng
-        first, end = index.task_episode[tasks, None], index.task_episode[tasks + 1, None]
-        n_candidates = self.hindsight_task_strategy.n_candidates
-        episode = first + (rng.random((len(tasks), n_candidates)) * (end - first)).astype(np.int64)
-        start, end = index.episode_row[episode], index.episode_row[episode + 1]
-        step = start + select_step(self.hindsight_task_strategy, end - start, rng)
-        reached = self.trajectory(self.episodes.rows[index.rows[step]][..., None, :])
-        hindsight_task = self.task_family.hindsight_task(reached, 0)
-        chosen = np.arange(len(tasks)), choose_rare(self._count_alike(reached, hindsight_task), rng)
-        source = np.stack([start[chosen], end[chosen]], axis=1)
-        rl_source = source if self.rl_batch_source == "episode" else self._task_sources(index, tasks)[1]
-        return np.stack([source, rl_source]), hindsight_task[chosen]
-
-    def _count_alike(self, reached: Trajectory, task: np.ndarray) -> np.ndarray:
-        """(n, n_candidates), how many of some other rows solve each candidate's task with their first candidate, plus 1."""
-        if task.shape[1] == 1:
-            return np.ones(task.shape[:2])
-        first = Trajectory(*(values[:MAX_COMPARED, 0] for values in reached))
-        return 1 + self.task_family.is_success(first, task[:, :, None])[..., 0].sum(axis=-1)
-
-    def _write_rewards(self, rows: np.ndarray, where: np.ndarray, tasks: np.ndarray, reward_type: str) -> None:
-        """Give ``rows[where]`` the rewards of ``tasks``, one for each of them, in one call of the reward hook."""
-        traj = self.trajectory(rows.take(where, axis=0)[:, None])
+        :param rows: (n, width) transitions, changed in place
+        :param where: (m,) int
+        :param tasks: (m, task_dim), one for each of them
+        :param reward_type: ``"sparse"`` or ``"dense"``
+        :raises ValueError: if the reward hook returns NaN or infinity
+        """
+        traj = self.transitions.trajectory(rows.take(where, axis=0)[:, None])
         reward = self.task_family.compute_reward(traj, tasks, reward_type=reward_type)[:, 0]
         if not np.isfinite(reward).all():
             raise ValueError("compute_reward returned NaN or infinity for a hindsight task, expected finite rewards.")
-        rows[where, self._reward] = reward
+        rows[where, self.transitions.reward] = reward

@@ -1,5 +1,5 @@
-from sb3_htr.pearl.files import load_untrusted
 from sb3_htr.pearl.pearl import PEARL
 from sb3_htr.pearl.policies import MlpPolicy
+from sb3_htr.pearl.untrusted import load_untrusted
 
 __all__ = ["PEARL", "MlpPolicy", "load_untrusted"]

@@ -11,26 +11,6 @@ from sb3_htr.common.linear import with_fast_linear
 MIN_VARIANCE = 1e-7
 
 
-def product_of_gaussians(mean: th.Tensor, variance: th.Tensor, lengths: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-    """
-    Products of Gaussian factors, of several groups at once.
-
-    :param mean: (n, latent_dim), those of the first group first
-    :param variance: (n, latent_dim), positive
-    :param lengths: (M,) int64, number of factors of each group
-    :return: mean and variance (M, latent_dim); those of N(0, 1) where a group has no factors
-    """
-    precision = 1.0 / variance
-    total = _sum_groups(precision, lengths)
-    empty = total == 0
-    posterior_variance = 1.0 / total.masked_fill(empty, 1.0)
-    return posterior_variance * _sum_groups(precision * mean, lengths), posterior_variance
-
-
-def _sum_groups(values: th.Tensor, lengths: th.Tensor) -> th.Tensor:
-    return th.segment_reduce(values, "sum", lengths=lengths, axis=0, unsafe=True)
-
-
 def kl_to_prior(mean: th.Tensor, variance: th.Tensor) -> th.Tensor:
     """
     :param mean: (..., latent_dim)
@@ -43,6 +23,12 @@ def kl_to_prior(mean: th.Tensor, variance: th.Tensor) -> th.Tensor:
 class ContextEncoder(nn.Module):
     """
     Maps a set of transitions (o, a, r) to a Gaussian posterior over the task variable z, whatever their order.
+
+    The posterior is a product of Gaussians, one factor for each transition. What was taken in of a task is the sum of the
+    factors' precisions and that of their precisions times means, (n_tasks, 2 * latent_dim).
+
+    An encoder of another kind has the same three methods, see :class:`sb3_htr.adaptation.policy.Encoder`, and the same
+    constructor: ``policy_kwargs={"encoder_class": MyEncoder}``.
 
     :param context_dim: length of a context row, obs_dim + action_dim + 1
     :param latent_dim: dimension of z
@@ -59,11 +45,30 @@ class ContextEncoder(nn.Module):
         self.latent_dim = latent_dim
         self.factors = with_fast_linear(nn.Sequential(*create_mlp(context_dim, 2 * latent_dim, net_arch, activation_fn)))
 
-    def forward(self, context: th.Tensor, lengths: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def empty(self, n_tasks: int) -> th.Tensor:
         """
-        :param context: (n, context_dim), the contexts of several tasks, one after another
-        :param lengths: (M,) int64, number of rows of each
-        :return: mean and variance of the posteriors, (M, latent_dim) each
+        :param n_tasks: number of tasks
+        :return: (n_tasks, 2 * latent_dim), nothing taken in yet
         """
-        mean, raw = self.factors(context).chunk(2, dim=-1)
-        return product_of_gaussians(mean, F.softplus(raw).clamp(min=MIN_VARIANCE), lengths)
+        return next(self.parameters()).new_zeros(n_tasks, 2 * self.latent_dim)
+
+    def extend(self, state: th.Tensor, rows: th.Tensor, lengths: th.Tensor) -> th.Tensor:
+        """
+        :param state: (n_tasks, 2 * latent_dim), what was taken in before
+        :param rows: (n, context_dim), those of the first task first
+        :param lengths: (n_tasks,) int64, number of rows of each task
+        :return: (n_tasks, 2 * latent_dim), with these rows taken in
+        """
+        mean, raw = self.factors(rows).chunk(2, dim=-1)
+        precision = 1.0 / F.softplus(raw).clamp(min=MIN_VARIANCE)
+        factors = th.cat([precision, precision * mean], dim=1)
+        return state + th.segment_reduce(factors, "sum", lengths=lengths, axis=0, unsafe=True)
+
+    def posterior(self, state: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param state: (n_tasks, 2 * latent_dim), what was taken in
+        :return: mean and variance (n_tasks, latent_dim), those of the prior N(0, I) where nothing was taken in
+        """
+        precision, precision_mean = state.chunk(2, dim=-1)
+        variance = 1.0 / precision.masked_fill(precision == 0, 1.0)
+        return variance * precision_mean, variance

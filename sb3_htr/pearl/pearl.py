@@ -1,35 +1,22 @@
-"""PEARL with hindsight task relabelling."""
+"""PEARL: encoder, critics and actor, and how they learn."""
 
-from typing import Any, ClassVar, TypeVar, cast
+from typing import Any, ClassVar
 
-import numpy as np
 import torch as th
-from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule, TrainFreq
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
-from sb3_htr.common import checks
+from sb3_htr.adaptation.explorers import Explorer
+from sb3_htr.common.checks import check_numbers
 from sb3_htr.common.matmul import PRECISIONS, matmul_precision
-from sb3_htr.common.type_aliases import TaskFamily
-from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.pearl.divergence import PosteriorWatch, check_finite
 from sb3_htr.pearl.encoder import ContextEncoder, kl_to_prior
-from sb3_htr.pearl.exploration import to_explorer
-from sb3_htr.pearl.files import SavesToFiles
-from sb3_htr.pearl.meta_test import AdaptsAtMetaTest
+from sb3_htr.pearl.off_policy_meta_algorithm import OffPolicyMetaAlgorithm
 from sb3_htr.pearl.policies import LatentCritic, MlpPolicy, PEARLPolicy
-from sb3_htr.pearl.rollout import collect_adaptations
-from sb3_htr.pearl.task_bank import TaskBank
-from sb3_htr.pearl.task_belief import KnownTasks
-
-SelfPEARL = TypeVar("SelfPEARL", bound="PEARL")
 
 
-class PEARL(AdaptsAtMetaTest, SavesToFiles):
+class PEARL(OffPolicyMetaAlgorithm):
     """
     Probabilistic Embeddings for Actor-critic RL (PEARL), with Hindsight Task Relabelling (HTR) in its replay buffer.
 
@@ -62,14 +49,15 @@ class PEARL(AdaptsAtMetaTest, SavesToFiles):
         tasks, beside the critics' squared errors averaged over transitions (PEARL's reference, in these units: 0.0016)
     :param n_tasks_per_rollout: training tasks per rollout (PEARL's reference: 10)
     :param n_episodes_per_task: episodes on each of them
-    :param n_exploration_episodes: episodes before the posterior is used, for the explorer ``"prior"``
-    :param explorer: how z is drawn before the posterior is used at meta-test, see :class:`Explorer`
+    :param explorer: chooses z at meta-test: an :class:`sb3_htr.adaptation.Explorer`, its name, or its name and settings,
+        ``{"name": "prior", "n_exploration_episodes": 9}``
     :param train_explorer: the same for rollouts
     :param matmul_precision: of matrix products in updates, as for ``torch.set_float32_matmul_precision``. ``"medium"`` rounds
         their factors to bfloat16, which on hardware that has it takes half the time
     :param stats_window_size: episodes over which logged returns are averaged
     :param tensorboard_log: folder for TensorBoard, none by default
-    :param policy_kwargs: arguments of the policy: ``latent_dim``, ``net_arch``, ``encoder_arch`` (paper: 5, 3x300, 3x200)
+    :param policy_kwargs: arguments of the policy: ``latent_dim``, ``net_arch``, ``encoder_arch`` (paper: 5, 3x300, 3x200),
+        ``normalize_observations``
     :param verbose: 0 nothing, 1 info, 2 debug
     :param seed: seed of all random generators
     :param device: torch device
@@ -81,7 +69,6 @@ class PEARL(AdaptsAtMetaTest, SavesToFiles):
     critic: LatentCritic  # type: ignore[assignment]
     critic_target: LatentCritic  # type: ignore[assignment]
     encoder: ContextEncoder
-    replay_buffer: MultiTaskReplayBuffer | None
 
     def __init__(
         self,
@@ -104,9 +91,8 @@ class PEARL(AdaptsAtMetaTest, SavesToFiles):
         kl_coef: float = 0.001,
         n_tasks_per_rollout: int = 20,
         n_episodes_per_task: int = 10,
-        n_exploration_episodes: int = 5,
-        explorer: str = "search",
-        train_explorer: str = "aggregate",
+        explorer: Explorer | dict[str, Any] | str = "search",
+        train_explorer: Explorer | dict[str, Any] | str = "aggregate",
         matmul_precision: str = "highest",
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -117,15 +103,10 @@ class PEARL(AdaptsAtMetaTest, SavesToFiles):
         _init_setup_model: bool = True,
     ) -> None:
         infinity = float("inf")
-        checks.check_numbers(
+        check_numbers(
             meta_batch_size=(meta_batch_size, 1, infinity),
             batch_size=(batch_size, 1, infinity),
-            context_size=(context_size, 1, infinity),
-            n_tasks_per_rollout=(n_tasks_per_rollout, 1, infinity),
-            n_episodes_per_task=(n_episodes_per_task, 1, infinity),
-            n_exploration_episodes=(n_exploration_episodes, 0, infinity),
             gradient_steps=(gradient_steps, 1, infinity),
-            learning_starts=(learning_starts, 0, infinity),
             target_update_interval=(target_update_interval, 1, infinity),
             kl_coef=(kl_coef, 0.0, infinity),
             gamma=(gamma, 0.0, 1.0),
@@ -133,16 +114,9 @@ class PEARL(AdaptsAtMetaTest, SavesToFiles):
         )
         if matmul_precision not in PRECISIONS:
             raise ValueError(f"matmul_precision is {matmul_precision!r}, expected one of {list(PRECISIONS)}.")
-        buffer_class = replay_buffer_class or MultiTaskReplayBuffer
-        checks.check_keywords("replay_buffer_kwargs", replay_buffer_kwargs or {}, buffer_class)
-        if isinstance(env, str):
-            env = make_task_vec_env(env, n_tasks_per_rollout, seed=seed)
-        if env is not None:
-            env = self._wrap_env(env)
-            checks.check_spaces(env)
         super().__init__(
             policy=policy,
-            env=env,  # type: ignore[arg-type]
+            env=env,
             learning_rate=learning_rate,
             buffer_size=buffer_size,
             learning_starts=learning_starts,
@@ -150,170 +124,42 @@ class PEARL(AdaptsAtMetaTest, SavesToFiles):
             tau=tau,
             gamma=gamma,
             gradient_steps=gradient_steps,
-            replay_buffer_class=buffer_class,
+            replay_buffer_class=replay_buffer_class,
             replay_buffer_kwargs=replay_buffer_kwargs,
             ent_coef=ent_coef,
             target_update_interval=target_update_interval,
             target_entropy=target_entropy,
+            context_size=context_size,
+            n_tasks_per_rollout=n_tasks_per_rollout,
+            n_episodes_per_task=n_episodes_per_task,
+            explorer=explorer,
+            train_explorer=train_explorer,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
-            policy_kwargs={} if policy_kwargs is None else dict(policy_kwargs),
+            policy_kwargs=policy_kwargs,
             verbose=verbose,
             seed=seed,
             device=device,
-            _init_setup_model=False,
         )
-        # SAC adds an argument for state-dependent exploration, which PEARL does not have: z explores
-        self.policy_kwargs.pop("use_sde")
-        checks.check_keywords("policy_kwargs", self.policy_kwargs, self.policy_class)
         self.meta_batch_size = meta_batch_size
-        self.context_size = context_size
         self.kl_coef = kl_coef
-        self.n_tasks_per_rollout = n_tasks_per_rollout
-        self.n_episodes_per_task = n_episodes_per_task
-        self.n_exploration_episodes = n_exploration_episodes
-        self.explorer = to_explorer(explorer).value
-        self.train_explorer = to_explorer(train_explorer).value
         self.matmul_precision = matmul_precision
-        self.task_bank: TaskBank | None = None
-        # Training tasks in the order of the coming rollouts: every task once, then every task once in another order
-        self._task_queue = np.zeros(0, dtype=np.int64)
-        self._n_rollouts = 0
-        self._warned_not_adapted = False
         self._posterior_watch = PosteriorWatch()
         if _init_setup_model:
             self._setup_model()
-
-    def _setup_model(self) -> None:
-        if self.env is None:
-            # Loaded for prediction only: SB3 wants a buffer, we want no memory of it
-            self.replay_buffer = ReplayBuffer(1, self.observation_space, self.action_space)  # type: ignore[assignment]
-            super()._setup_model()
-            self.replay_buffer = None
-        else:
-            self._setup_replay(self.env)
-            super()._setup_model()
-
-    def _setup_replay(self, env: VecEnv) -> None:
-        checks.check_reward_is_not_normalized(env)
-        checks.check_reward_is_sparse(env)
-        family: TaskFamily = checks.get_task_family(env)
-        replay_buffer_class = cast(type[MultiTaskReplayBuffer], self.replay_buffer_class)
-        self.replay_buffer = replay_buffer_class(
-            self.buffer_size,
-            self.observation_space,
-            self.action_space,
-            device=self.device,
-            n_envs=self.n_envs,
-            seed=self.seed,
-            task_family=family,
-            max_episode_steps=checks.get_max_episode_steps(env),
-            **self.replay_buffer_kwargs,
-        )
-        self.task_bank = TaskBank(family)
-
-    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """
-        :param env: env of the same spaces and number of copies; its task family replaces the old one if nothing was collected
-        :param force_reset: reset before training goes on
-        """
-        super().set_env(env, force_reset)
-        assert self.env is not None
-        if self.replay_buffer is None:
-            self._setup_replay(self.env)
 
     def _create_aliases(self) -> None:
         super()._create_aliases()
         self.encoder = self.policy.encoder
 
-    def set_random_seed(self, seed: int | None = None) -> None:
-        """
-        :param seed: seed of python, numpy, torch, envs, rollout tasks and replay buffer
-        """
-        super().set_random_seed(seed)
-        self._rng = np.random.default_rng(seed)
-        if isinstance(self.replay_buffer, MultiTaskReplayBuffer) and seed is not None:
-            self.replay_buffer.seed(seed)
-
-    def learn(
-        self: SelfPEARL,
-        total_timesteps: int = 150_000,
-        callback: MaybeCallback = None,
-        log_interval: int | None = 1,
-        tb_log_name: str = "PEARL",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfPEARL:
-        """
-        Meta-train.
-
-        :param total_timesteps: env steps; the last rollout is finished
-        :param callback: called at every step
-        :param log_interval: rollouts between two logs, None for no logs
-        :param tb_log_name: name of the run for TensorBoard
-        :param reset_num_timesteps: count env steps from 0
-        :param progress_bar: show one
-        :return: self
-        """
-        return super().learn(
-            total_timesteps=total_timesteps,
-            callback=callback,
-            log_interval=log_interval,  # type: ignore[arg-type]
-            tb_log_name=tb_log_name,
-            reset_num_timesteps=reset_num_timesteps,
-            progress_bar=progress_bar,
-        )
-
-    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
-        # The last rollout may go beyond the budget, and a schedule must not go below its end
-        super()._update_current_progress_remaining(min(num_timesteps, total_timesteps), total_timesteps)
-
-    def collect_rollouts(  # type: ignore[override]
-        self,
-        env: VecEnv,
-        callback: BaseCallback,
-        train_freq: TrainFreq,
-        replay_buffer: MultiTaskReplayBuffer,
-        action_noise: ActionNoise | None = None,
-        learning_starts: int = 0,
-        log_interval: int | None = None,
-    ) -> RolloutReturn:
-        """
-        Adapt to ``n_tasks_per_rollout`` training tasks, one per env at a time, and store all that happens.
-
-        :param env: training env
-        :param callback: called at every step
-        :param train_freq: not used, a rollout is whole adaptations
-        :param replay_buffer: where the steps go
-        :param action_noise: not used
-        :param learning_starts: env steps with random actions
-        :param log_interval: rollouts between two logs
-        :return: what was collected
-        """
-        assert self.task_bank is not None
-        self.policy.set_training_mode(False)
-        callback.on_rollout_start()
-        rollout = collect_adaptations(self, env, callback, replay_buffer, learning_starts)
-        if not rollout.continue_training:
-            return rollout
-        if self._n_rollouts == 0:
-            replay_buffer.check_reward_hook()
-        self.task_bank.update(replay_buffer)
-        self.logger.record("rollout/train_tasks_reached", len(self.task_bank.solved))
-        callback.on_rollout_end()
-        self._n_rollouts += 1
-        if log_interval is not None and self._n_rollouts % log_interval == 0:
-            self.dump_logs()
-        return rollout
-
     def train(self, gradient_steps: int, batch_size: int = 16) -> None:
         """
-        Update encoder, critics and actor, then what is known about z before a reward.
+        Update encoder, critics and actor, then what explorers know about z.
 
         :param gradient_steps: number of updates
         :param batch_size: transitions per task for actor and critics
         """
-        assert self.replay_buffer is not None and self.task_bank is not None
+        assert self.replay_buffer is not None
         self.policy.set_training_mode(True)
         optimizers = [self.actor.optimizer, self.critic.optimizer, self.encoder.optimizer]
         if self.ent_coef_optimizer is not None:
@@ -329,28 +175,25 @@ class PEARL(AdaptsAtMetaTest, SavesToFiles):
         for key, value in self.replay_buffer.stats().items():
             self.logger.record(key, value)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self._update_latent_prior(th.cat(means[-20:]))
+        self._learn_knowledge(th.cat(means[-20:]))
 
     def _update(self, batch_size: int) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """One update of all networks. Posterior means (M, latent_dim), and what to log."""
         assert self.replay_buffer is not None
         data = self.replay_buffer.sample(
-            batch_size,
-            env=self._vec_normalize_env,
-            meta_batch_size=self.meta_batch_size,
-            context_size=self.context_size,
+            batch_size, meta_batch_size=self.meta_batch_size, context_size=self.context_size
         )
         # Each task has the same weight in a mean over transitions
         weight = (1.0 / (self.meta_batch_size * data.lengths)).repeat_interleave(data.lengths, output_size=len(data.rewards))
         # One backward pass through the encoder: it learns from the critics' errors and the KL term
-        mean, variance = self.encoder(data.context, data.context_lengths)
+        mean, variance = self.policy.infer(data.context)
         z = mean + variance.sqrt() * th.randn_like(mean)
         kl = kl_to_prior(mean, variance).mean()
         z_rows = z.repeat_interleave(data.lengths, dim=0, output_size=len(data.rewards))
-        obs_z = th.cat([data.observations, z_rows], dim=1)
+        obs_z = th.cat([self.policy.normalize(data.observations), z_rows], dim=1)
         ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp()
         with th.no_grad():
-            next_obs_z = th.cat([data.next_observations, z_rows], dim=1)
+            next_obs_z = th.cat([self.policy.normalize(data.next_observations), z_rows], dim=1)
             next_actions, next_log_prob = self.policy.sample_actions(next_obs_z)
             next_q = self.critic_target(next_obs_z, next_actions).amin(dim=0) - ent_coef * next_log_prob
             target_q = data.rewards + (1 - data.dones) * self.gamma * next_q
@@ -393,24 +236,8 @@ class PEARL(AdaptsAtMetaTest, SavesToFiles):
         }
         return mean.detach(), log
 
-    def _update_latent_prior(self, means: th.Tensor) -> None:
-        assert self.replay_buffer is not None and self.task_bank is not None
-        prior = self.policy.latent_prior
-        prior.set_aggregate(means)
-        n_solved = min(len(self.task_bank.solved), prior.max_known_tasks)
-        # A loaded model's known tasks are kept until this training knows as many
-        if n_solved >= max(int(prior.n_known_tasks), 1):
-            best = self.task_bank.best_episodes(self.replay_buffer, prior.max_known_tasks, self.context_size)
-            context, lengths, returns, first_success = best
-            if self._vec_normalize_env is not None:
-                obs = slice(0, self.replay_buffer.obs_dim)
-                context[:, obs] = self._vec_normalize_env.normalize_obs(context[:, obs])
-            with th.no_grad():
-                z, _ = self.encoder(th.as_tensor(context, device=self.device), th.as_tensor(lengths, device=self.device))
-            prior.set_known_tasks(KnownTasks(z.cpu().numpy(), returns, first_success))
-
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "encoder", "task_bank", "_posterior_watch"]
+        return [*super()._excluded_save_params(), "encoder", "_posterior_watch"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

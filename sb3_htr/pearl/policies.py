@@ -13,9 +13,11 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, SACPolicy
 from torch import nn
 
+from sb3_htr.adaptation.context import context_dim, context_rows
 from sb3_htr.common.linear import Linear, with_fast_linear
+from sb3_htr.common.normalizer import ObservationNormalizer
+from sb3_htr.common.type_aliases import Context
 from sb3_htr.pearl.encoder import ContextEncoder
-from sb3_htr.pearl.exploration import LatentPrior
 
 
 class LatentCritic(BaseModel):
@@ -68,7 +70,10 @@ class PEARLPolicy(SACPolicy):
     :param lr_schedule: learning rate
     :param net_arch: hidden units of actor and critics (paper A.2: ``[300, 300, 300]``)
     :param encoder_arch: hidden units of the context encoder (paper A.2: ``[200, 200, 200]``)
+    :param encoder_class: what infers z, see :class:`ContextEncoder`
     :param latent_dim: dimension of z (paper A.2: 5)
+    :param normalize_observations: all networks see observations less their running mean in training, divided by the standard
+        deviation
     :param activation_fn: activation of all networks
     :param n_critics: number of critics
     :param optimizer_class: optimizer of all networks
@@ -82,7 +87,9 @@ class PEARLPolicy(SACPolicy):
         lr_schedule: Schedule,
         net_arch: list[int] | None = None,
         encoder_arch: list[int] | None = None,
+        encoder_class: type[ContextEncoder] = ContextEncoder,
         latent_dim: int = 5,
+        normalize_observations: bool = False,
         activation_fn: type[nn.Module] = nn.ReLU,
         n_critics: int = 2,
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
@@ -94,8 +101,10 @@ class PEARLPolicy(SACPolicy):
             optimizer_kwargs = {"fused": True, **(optimizer_kwargs or {})}
         self.latent_dim = latent_dim
         self.encoder_arch = [128, 128] if encoder_arch is None else encoder_arch
-        obs_dim = int(np.prod(observation_space.shape))
-        self.context_dim = obs_dim + int(np.prod(action_space.shape)) + 1
+        self.encoder_class = encoder_class
+        self.normalize_observations = normalize_observations
+        obs_dim, action_dim = (int(np.prod(space.shape)) for space in (observation_space, action_space))
+        self.obs_dim, self.context_dim = obs_dim, context_dim(obs_dim, action_dim)
         # SB3's networks are built for the observation (o, z)
         super().__init__(
             spaces.Box(-np.inf, np.inf, (obs_dim + latent_dim,), np.float32),
@@ -112,12 +121,12 @@ class PEARLPolicy(SACPolicy):
     @property
     def device(self) -> th.device:
         """Where the networks are. SB3 looks for it among all parameters, which takes longer than to act."""
-        return self.latent_prior.mean.device
+        return self.actor.mu.weight.device if hasattr(self, "actor") else super().device
 
     def _build(self, lr_schedule: Schedule) -> None:
-        self.latent_prior = LatentPrior(self.latent_dim)
         super()._build(lr_schedule)
-        self.encoder = ContextEncoder(self.context_dim, self.latent_dim, self.encoder_arch, self.activation_fn)
+        self.normalizer = ObservationNormalizer(self.obs_dim) if self.normalize_observations else None
+        self.encoder = self.encoder_class(self.context_dim, self.latent_dim, self.encoder_arch, self.activation_fn)
         self.encoder.optimizer = self.optimizer_class(
             self.encoder.parameters(),
             lr=lr_schedule(1),  # type: ignore[call-arg]
@@ -149,7 +158,9 @@ class PEARLPolicy(SACPolicy):
             observation_space=self.observation_space,
             action_space=self.action_space,
             encoder_arch=self.encoder_arch,
+            encoder_class=self.encoder_class,
             latent_dim=self.latent_dim,
+            normalize_observations=self.normalize_observations,
             **{key: data[key] for key in keys},
         )
 
@@ -174,20 +185,51 @@ class PEARLPolicy(SACPolicy):
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         assert isinstance(observation, th.Tensor)
-        obs = observation.flatten(1).float()
+        obs = self.normalize(observation.flatten(1).float())
         return self._act(th.cat([obs, self._z.expand(len(obs), -1)], dim=1), deterministic)
 
-    def act(self, obs: np.ndarray, z: np.ndarray) -> np.ndarray:
+    def act(self, obs: np.ndarray, z: np.ndarray, deterministic: bool = False) -> np.ndarray:
         """
-        What :meth:`predict` does, without its checks and conversions, which take longer: for every step of a rollout.
+        What :meth:`predict` does, without its checks and conversions, which take longer: for every step of an adaptation.
 
-        :param obs: (n, obs_dim) float32
+        :param obs: (n, obs_dim)
         :param z: (n, latent_dim) float32
-        :return: (n, action_dim), sampled actions scaled to [-1, 1]
+        :param deterministic: mean actions instead of samples
+        :return: (n, action_dim), scaled to [-1, 1]
         """
         with th.no_grad():
-            obs_z = th.as_tensor(np.concatenate([obs.reshape(len(obs), -1), z], axis=1), device=self.device)
-            return self._act(obs_z, deterministic=False).cpu().numpy()
+            normal = self.normalize(th.as_tensor(obs, dtype=th.float32, device=self.device))
+            obs_z = th.cat([normal, th.as_tensor(z, device=self.device)], dim=1)
+            return np.asarray(self._act(obs_z, deterministic).cpu().numpy())
+
+    def normalize(self, obs: th.Tensor) -> th.Tensor:
+        """
+        :param obs: (n, obs_dim), as the env gave them
+        :return: the same shape, as all networks see them
+        """
+        return obs if self.normalizer is None else self.normalizer(obs)
+
+    def watch(self, obs: np.ndarray) -> None:
+        """
+        :param obs: (n, obs_dim), newly observed in training: what observations are normalized by follows them
+        """
+        if self.normalizer is not None:
+            self.normalizer.update(obs)
+
+    def extend_posterior(self, state: th.Tensor, context: Context) -> th.Tensor:
+        """
+        :param state: (n_tasks, ...), what the encoder has taken in of each task before
+        :param context: transitions as they were collected
+        :return: (n_tasks, ...), with these taken in
+        """
+        return self.encoder.extend(state, context_rows(context, self.normalize), context.lengths)
+
+    def infer(self, context: Context) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param context: transitions as they were collected
+        :return: mean and variance (n_tasks, latent_dim) of the posteriors over z
+        """
+        return self.encoder.posterior(self.extend_posterior(self.encoder.empty(len(context.lengths)), context))
 
     def _act(self, obs_z: th.Tensor, deterministic: bool) -> th.Tensor:
         mean, log_std = self._gaussian(obs_z)

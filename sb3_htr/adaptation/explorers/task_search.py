@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from sb3_htr.pearl.task_belief import KnownTasks, TaskBelief
+from sb3_htr.adaptation.explorers.task_belief import TaskBelief
+from sb3_htr.adaptation.knowledge import KnownTasks
 
 
 class TaskSearch:

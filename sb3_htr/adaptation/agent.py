@@ -1,8 +1,7 @@
 """What :meth:`sb3_htr.PEARL.adapt` returns."""
 
 import numpy as np
-
-from sb3_htr.pearl.policies import PEARLPolicy
+from stable_baselines3.common.policies import BasePolicy
 
 
 class AdaptedAgent:
@@ -15,7 +14,7 @@ class AdaptedAgent:
     :param successes: (n_episodes,) bool, whether each adaptation episode solved the task
     """
 
-    def __init__(self, policy: PEARLPolicy, z: np.ndarray, returns: np.ndarray, successes: np.ndarray) -> None:
+    def __init__(self, policy: BasePolicy, z: np.ndarray, returns: np.ndarray, successes: np.ndarray) -> None:
         self.policy = policy
         self.z = z
         self.returns = returns

@@ -3,18 +3,15 @@
 import os
 import warnings
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
-from stable_baselines3.common.logger import CSVOutputFormat
-from stable_baselines3.common.vec_env import sync_envs_normalization
+from stable_baselines3.common.callbacks import EvalCallback
 
+from sb3_htr.adaptation.evaluation import MetaLearner, record_adaptation
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checks import get_task_family
-from sb3_htr.common.evaluation import MetaLearner, record_adaptation
 
 
 class MetaEvalCallback(EvalCallback):
@@ -29,7 +26,7 @@ class MetaEvalCallback(EvalCallback):
     :param eval_env: env of the task family
     :param tasks: ``"validation"``, ``"test"`` or task vectors (n_tasks, task_dim)
     :param n_adaptation_episodes: episodes per task (PEARL's reference: 20)
-    :param explorer: how z is drawn before the posterior is used, the model's own by default
+    :param explorer: an :class:`sb3_htr.adaptation.Explorer`, its name, or its name and settings; the model's own by default
     :param kwargs: arguments of SB3's ``EvalCallback``; ``n_eval_episodes`` has no effect, each task is adapted to once
     """
 
@@ -39,7 +36,7 @@ class MetaEvalCallback(EvalCallback):
         *args: Any,
         tasks: str | np.ndarray = "validation",
         n_adaptation_episodes: int = 20,
-        explorer: str | None = None,
+        explorer: Any = None,
         **kwargs: Any,
     ) -> None:
         super().__init__(eval_env, *args, **kwargs)
@@ -84,8 +81,6 @@ class MetaEvalCallback(EvalCallback):
     def _on_step(self) -> bool:
         if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
             return True
-        if self.model.get_vec_normalize_env() is not None:
-            sync_envs_normalization(self.training_env, self.eval_env)
         record = record_adaptation(
             cast(MetaLearner, self.model),
             self.eval_env,
@@ -149,81 +144,3 @@ class MetaEvalCallback(EvalCallback):
                 f"Eval num_timesteps={self.num_timesteps}: return of adaptation episode 1: {returns[:, 0].mean():.2f}, "
                 f"of episode {returns.shape[1]}: {self.last_mean_reward:.2f}, success {successes[:, -1].mean():.0%}"
             )
-
-
-class ProgressCallback(BaseCallback):
-    """
-    Writes what the algorithm logs to a CSV file too, wherever else it goes.
-
-    :param path: file
-    """
-
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        super().__init__()
-        self.path = os.fspath(path)
-        self._written: dict[str, Any] = {"keys": [], "text": ""}
-
-    def state_dict(self) -> dict[str, Any]:
-        """
-        :return: what was written so far
-        """
-        return {"keys": list(self._output.keys), "text": Path(self.path).read_text()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """
-        :param state: of :meth:`state_dict`; to be set before the training starts
-        """
-        self._written = state
-
-    def _on_training_start(self) -> None:
-        self._output = CSVOutputFormat(self.path)
-        self._output.keys = list(self._written["keys"])
-        self._output.file.write(self._written["text"])
-        self._output.file.flush()
-        self.logger.output_formats.append(self._output)
-
-    def _on_step(self) -> bool:
-        return True
-
-    def _on_training_end(self) -> None:
-        # rl_zoo3 may end the training of a callback a second time
-        if self._output in self.logger.output_formats:
-            self.logger.output_formats.remove(self._output)
-            self._output.close()
-
-
-class TrialResult(Protocol):
-    """The part of an Optuna trial that :class:`MetaTrialEvalCallback` uses."""
-
-    def report(self, value: float, step: int) -> None:
-        """Report an intermediate value."""
-        ...
-
-    def should_prune(self) -> bool:
-        """Whether the trial is hopeless."""
-        ...
-
-
-class MetaTrialEvalCallback(MetaEvalCallback):
-    """
-    :class:`MetaEvalCallback` for a trial of a hyperparameter search; has the attributes of rl_zoo3's ``TrialEvalCallback``.
-
-    :param eval_env: env of the task family
-    :param trial: told of every evaluation, and asked whether to go on
-    :param kwargs: as for :class:`MetaEvalCallback`
-    """
-
-    def __init__(self, eval_env: Any, trial: TrialResult, **kwargs: Any) -> None:
-        super().__init__(eval_env, **{"verbose": 0, **kwargs})
-        self.trial = trial
-        self.eval_idx = 0
-        self.is_pruned = False
-
-    def _on_step(self) -> bool:
-        n_evaluations = len(self.returns)
-        continue_training = super()._on_step()
-        if len(self.returns) > n_evaluations:
-            self.eval_idx += 1
-            self.trial.report(self.last_mean_reward, self.eval_idx)
-            self.is_pruned = self.trial.should_prune()
-        return continue_training and not self.is_pruned

@@ -1,8 +1,8 @@
 """Which of the known tasks is an unknown task like? A belief, updated by nothing but the rewards of an adaptation."""
 
-from typing import NamedTuple
-
 import numpy as np
+
+from sb3_htr.adaptation.knowledge import KnownTasks
 
 # Chance that a visit finds a task that it should find
 DETECTION_PROBABILITY = 0.8
@@ -15,21 +15,6 @@ RELATIVE_DEVIATION = 0.1
 PATIENCE = 1.2
 # Share of the known tasks, the most similar ones, that a visit may turn to when another has failed within the same episode
 NEARBY = 0.25
-
-
-class KnownTasks(NamedTuple):
-    """
-    What meta-training knows about n tasks and the episodes that solve them best.
-
-    :param z: (n, latent_dim), z of each task
-    :param returns: (n, n), ``returns[i, j]``: return of the episode of task i if task j is the true one, without the
-        task-free part, 0 where it does not find it
-    :param first_success: (n, n), number of steps before episode i finds task j, infinite where it does not
-    """
-
-    z: np.ndarray
-    returns: np.ndarray
-    first_success: np.ndarray
 
 
 class TaskBelief:

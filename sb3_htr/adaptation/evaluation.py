@@ -1,5 +1,6 @@
 """Meta-test: how well does an agent adapt to tasks that it has never seen?"""
 
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import gymnasium as gym
@@ -9,20 +10,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_htr.adaptation.loop import Adapts, adaptation_steps
 from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.vec_env import make_task_vec_env
-
-
-class AdaptsToTasks(Protocol):
-    """An adaptation in progress, see :class:`sb3_htr.pearl.adaptation.Adaptation`."""
-
-    z: np.ndarray
-
-    def observe(
-        self, obs: np.ndarray, actions: np.ndarray, rewards: np.ndarray, task_free_rewards: np.ndarray, dones: np.ndarray
-    ) -> None:
-        """Take in one step of each env."""
-        ...
 
 
 class MetaLearner(Protocol):
@@ -33,13 +23,7 @@ class MetaLearner(Protocol):
         """Networks, an SB3 policy."""
         ...
 
-    def start_adaptation(
-        self,
-        n_envs: int,
-        n_exploration_episodes: int | None = None,
-        explorer: str | None = None,
-        generator: th.Generator | None = None,
-    ) -> AdaptsToTasks:
+    def start_adaptation(self, n_envs: int, explorer: Any = None, generator: th.Generator | None = None) -> Adapts:
         """Begin to adapt to one task per env."""
         ...
 
@@ -59,39 +43,33 @@ class AdaptationRecord(NamedTuple):
 
 
 def run_adaptation(
-    policy: BasePolicy, env: VecEnv, adaptation: AdaptsToTasks, n_episodes: int, deterministic: bool = True
+    policy: BasePolicy, env: VecEnv, adaptation: Adapts, n_episodes: int, deterministic: bool = True
 ) -> AdaptationRecord:
     """
     Run ``n_episodes`` episodes of each env, from a reset on.
 
-    :param policy: acts with ``adaptation.z``
+    :param policy: knows the action space
     :param env: its tasks, or the options to set them at the next reset, are given already
-    :param adaptation: learns from the episodes
+    :param adaptation: acts, and learns from the episodes
     :param n_episodes: episodes per env
     :param deterministic: mean actions instead of samples
     :return: one row per env
     """
     n_envs = env.num_envs
-    obs = env.reset()
     episode, envs = np.zeros(n_envs, dtype=np.int64), np.arange(n_envs)
     returns = np.zeros((n_envs, n_episodes + 1))
     successes = np.zeros((n_envs, n_episodes + 1), dtype=bool)
     steps: list[np.ndarray] = []
     episode_of_step: list[np.ndarray] = []
-    while (episode < n_episodes).any():
-        assert isinstance(obs, np.ndarray)
-        actions, _ = policy.predict(obs, (adaptation.z,), deterministic=deterministic)
-        new_obs, rewards, dones, infos = env.step(actions)
+    act = partial(adaptation.act, deterministic=deterministic)
+    for step in adaptation_steps(env, adaptation, n_episodes, policy.unscale_action, act):
         # Envs that are ahead of the others write to a column that is cut off
         column = np.minimum(episode, n_episodes)
-        returns[envs, column] += rewards
-        successes[envs, column] |= [info["is_success"] for info in infos]
-        steps.append(np.array([info["achieved_task"] for info in infos], dtype=np.float32))
+        returns[envs, column] += step.rewards
+        successes[envs, column] |= [info["is_success"] for info in step.infos]
+        steps.append(np.array([info["achieved_task"] for info in step.infos], dtype=np.float32))
         episode_of_step.append(column)
-        task_free = np.array([info["task_free_reward"] for info in infos])
-        adaptation.observe(obs, policy.scale_action(actions), rewards, task_free, dones)
-        obs = new_obs
-        episode += dones
+        episode += step.dones
     achieved = _by_episode(np.stack(steps, axis=1), np.stack(episode_of_step, axis=1), n_episodes)
     return AdaptationRecord(returns[:, :n_episodes], successes[:, :n_episodes], achieved)
 
@@ -112,8 +90,7 @@ def record_adaptation(
     env: VecEnv | gym.Env | str,
     tasks: np.ndarray | None = None,
     n_episodes: int = 20,
-    n_exploration_episodes: int | None = None,
-    explorer: str | None = None,
+    explorer: Any = None,
     deterministic: bool = True,
     seed: int = 0,
 ) -> AdaptationRecord:
@@ -137,7 +114,7 @@ def record_adaptation(
         # Envs without a task of their own repeat the last one
         index = np.minimum(np.arange(first, first + env.num_envs), len(tasks) - 1)
         env.set_options([{"task": task} for task in tasks[index]])
-        adaptation = model.start_adaptation(env.num_envs, n_exploration_episodes, explorer, generator)
+        adaptation = model.start_adaptation(env.num_envs, explorer, generator)
         record = run_adaptation(model.policy, env, adaptation, n_episodes, deterministic)
         records.append([values[: len(tasks) - first] for values in record])
     length = max(achieved.shape[2] for _, _, achieved in records)
@@ -152,8 +129,7 @@ def evaluate_adaptation(
     env: VecEnv | gym.Env | str,
     tasks: np.ndarray | None = None,
     n_episodes: int = 20,
-    n_exploration_episodes: int | None = None,
-    explorer: str | None = None,
+    explorer: Any = None,
     deterministic: bool = True,
     seed: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -163,16 +139,15 @@ def evaluate_adaptation(
     The context of a task's posterior comes from the episodes of this very adaptation and from nowhere else.
 
     :param model: a PEARL
-    :param env: env, VecEnv (its envs adapt side by side, each to a task of its own) or registered id; in the VecNormalize of
-        the training, if that had one
+    :param env: env, VecEnv (its envs adapt side by side, each to a task of its own) or registered id
     :param tasks: (n_tasks, task_dim), by default the test tasks of the env
     :param n_episodes: adaptation episodes per task; 20 in PEARL's reference
-    :param n_exploration_episodes: see :class:`sb3_htr.pearl.adaptation.Adaptation`; the model's own by default
-    :param explorer: how z is drawn before the posterior is used, the model's own by default; ``"prior"`` is PEARL's protocol
+    :param explorer: an :class:`sb3_htr.adaptation.Explorer`, its name, or its name and settings; the model's own by default;
+        ``"prior"`` is PEARL's protocol
     :param deterministic: mean actions instead of samples
     :param seed: seed of env and z; the random state of training is left alone
     :return: returns and successes, (n_tasks, n_episodes) each
     :raises ValueError: if there are no tasks or episodes, or the env has no task family
     """
-    record = record_adaptation(model, env, tasks, n_episodes, n_exploration_episodes, explorer, deterministic, seed)
+    record = record_adaptation(model, env, tasks, n_episodes, explorer, deterministic, seed)
     return record.returns, record.successes

@@ -1,0 +1,155 @@
+"""Adaptation to tasks, one per env, from nothing but the episodes of this adaptation."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+
+from sb3_htr.adaptation.context import evenly_spread
+from sb3_htr.adaptation.explorers import Explorer
+from sb3_htr.adaptation.knowledge import LatentKnowledge
+from sb3_htr.adaptation.policy import ContextualPolicy
+from sb3_htr.common.type_aliases import Context
+
+
+class Step(NamedTuple):
+    """
+    One step of each env.
+
+    :param observations: (n_envs, obs_dim), what the actions were chosen for
+    :param actions: (n_envs, action_dim), scaled to [-1, 1]
+    :param rewards: (n_envs,)
+    :param next_observations: (n_envs, obs_dim), the last one of its episode where one ended
+    :param dones: (n_envs,) bool, where an episode ended
+    :param infos: one dict per env
+    """
+
+    observations: np.ndarray
+    actions: np.ndarray
+    rewards: np.ndarray
+    next_observations: np.ndarray
+    dones: np.ndarray
+    infos: list[dict[str, Any]]
+
+    @property
+    def task_free_rewards(self) -> np.ndarray:
+        """(n_envs,), the part of the rewards that depends on no task."""
+        return np.array([info.get("task_free_reward", 0.0) for info in self.infos])
+
+
+class Adaptation:
+    """
+    Keeps the episodes of an adaptation and infers the posterior over z from those that the explorer wants in it.
+
+    Act with :meth:`act`, and feed every step to :meth:`observe`: the z that is acted with changes where an episode ends, and
+    where the explorer turns elsewhere within one.
+
+    :param policy: networks
+    :param knowledge: what meta-training knows about z
+    :param explorer: chooses z; not changed, this adaptation has a copy of its own, :attr:`explorer`
+    :param n_envs: number of tasks
+    :param context_size: steps of an episode that the posterior is inferred from, evenly spread, at most: as many as in
+        meta-training, because each narrows it
+    :param generator: source of randomness; torch's global one by default
+    """
+
+    def __init__(
+        self,
+        policy: ContextualPolicy,
+        knowledge: LatentKnowledge,
+        explorer: Explorer,
+        n_envs: int,
+        context_size: int,
+        generator: th.Generator | None = None,
+    ) -> None:
+        self.policy = policy
+        self.knowledge = knowledge
+        self.n_envs = n_envs
+        self.context_size = context_size
+        self.generator = generator
+        self.n_episodes = np.zeros(n_envs, dtype=np.int64)
+        # Without the task-free part: of the running episodes, and the largest of those that have ended
+        self.episode_return = np.zeros(n_envs, dtype=np.float64)
+        self.best_return = np.zeros(n_envs, dtype=np.float64)
+        # Of the running episodes: observations, actions, rewards
+        self._running: list[np.ndarray] = []
+        self._n_steps = np.zeros(n_envs, dtype=np.int64)
+        self._state = policy.encoder.empty(n_envs)
+        self.explorer = explorer.begin(self)
+
+    @property
+    def z(self) -> np.ndarray:
+        """(n_envs, latent_dim), the task variable to act with."""
+        return self.explorer.z
+
+    def act(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
+        """
+        :param obs: (n_envs, obs_dim)
+        :param deterministic: mean actions instead of samples
+        :return: (n_envs, action_dim), scaled to [-1, 1]
+        """
+        return self.policy.act(obs, self.z, deterministic)
+
+    def observe(self, step: Step) -> None:
+        """
+        :param step: what each env did
+        """
+        self._remember(step.observations, step.actions, step.rewards)
+        self.episode_return += step.rewards - step.task_free_rewards
+        ended = np.flatnonzero(step.dones)
+        self.n_episodes[ended] += 1
+        self.best_return[ended] = np.maximum(self.best_return[ended], self.episode_return[ended])
+        self.explorer.observe(step)
+        self.episode_return[ended] = 0
+        self._n_steps[ended] = 0
+
+    def _remember(self, *columns: np.ndarray) -> None:
+        if not self._running:
+            self._running = [np.zeros((self.n_envs, 64, *column.shape[1:]), dtype=np.float32) for column in columns]
+        elif self._n_steps.max() == self._running[0].shape[1]:
+            self._running = [np.concatenate([values, np.zeros_like(values)], axis=1) for values in self._running]
+        for values, column in zip(self._running, columns, strict=True):
+            values[np.arange(self.n_envs), self._n_steps] = column
+        self._n_steps += 1
+
+    def infer(self, envs: np.ndarray, keep: bool) -> None:
+        """
+        Take the running episodes of some envs into their posteriors.
+
+        :param envs: (k,) int
+        :param keep: what is in their posteriors already; if not, it is forgotten
+        """
+        if len(envs) == 0:
+            return
+        steps, lengths = evenly_spread(self._n_steps[envs], self.context_size)
+        at, device = (np.repeat(envs, lengths), steps), self.policy.device
+        context = Context(*(th.as_tensor(array, device=device) for array in (*(v[at] for v in self._running), lengths)))
+        before = self._state[envs] if keep else self.policy.encoder.empty(len(envs))
+        with th.no_grad():
+            self._state[envs] = self.policy.extend_posterior(before, context)
+
+    def posterior(self, envs: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """
+        :param envs: (k,) int, all by default
+        :return: mean and standard deviation (k, latent_dim), those of N(0, I) where no episode was taken in
+        """
+        state = self._state if envs is None else self._state[envs]
+        with th.no_grad():
+            mean, variance = self.policy.encoder.posterior(state)
+        return mean.cpu().numpy(), np.sqrt(variance.cpu().numpy())
+
+    def sample_posterior(self, envs: np.ndarray, widening: np.ndarray | float = 1.0) -> np.ndarray:
+        """
+        :param envs: (k,) int
+        :param widening: (k, 1), what the posteriors' standard deviations are multiplied by
+        :return: (k, latent_dim), a draw from each of their posteriors
+        """
+        mean, deviation = self.posterior(envs)
+        return np.asarray(mean + deviation * np.float32(widening) * self.noise(len(envs)))
+
+    def noise(self, n: int) -> np.ndarray:
+        """
+        :param n: number of draws
+        :return: (n, latent_dim) float32, draws from N(0, I)
+        """
+        return np.asarray(th.randn(n, self.policy.latent_dim, generator=self.generator).numpy())

@@ -1,0 +1,21 @@
+from sb3_htr.adaptation.explorers.aggregate import Aggregate
+from sb3_htr.adaptation.explorers.base import Explorer
+from sb3_htr.adaptation.explorers.prior import Prior
+from sb3_htr.adaptation.explorers.search import Search
+from sb3_htr.common.settings import make
+
+# For YAML files
+EXPLORERS: dict[str, type[Explorer]] = {"prior": Prior, "aggregate": Aggregate, "search": Search}
+
+
+def to_explorer(explorer: object) -> Explorer:
+    """
+    :param explorer: an :class:`Explorer`, its name, or its name and settings, such as
+        ``{"name": "prior", "n_exploration_episodes": 9}``
+    :return: an explorer with these settings
+    :raises ValueError: for an unknown name or setting
+    """
+    return make("explorer", explorer, EXPLORERS, Explorer)
+
+
+__all__ = ["EXPLORERS", "Aggregate", "Explorer", "Prior", "Search", "to_explorer"]

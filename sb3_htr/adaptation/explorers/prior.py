@@ -1,0 +1,47 @@
+"""PEARL's own protocol."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sb3_htr.adaptation.explorers.base import Explorer
+from sb3_htr.common.checks import check_numbers
+
+if TYPE_CHECKING:
+    from sb3_htr.adaptation.adaptation import Step
+
+
+@dataclass
+class Prior(Explorer):
+    """
+    z ~ N(0, I) for a fixed number of episodes, then from the posterior over all episodes.
+
+    :param n_exploration_episodes: episodes before the posterior is used (PEARL's reference, num_exp_traj_eval: 5)
+    """
+
+    n_exploration_episodes: int = 5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_numbers(n_exploration_episodes=(self.n_exploration_episodes, 0, float("inf")))
+
+    def start(self) -> None:
+        self.z = np.zeros((self.adaptation.n_envs, self.adaptation.policy.latent_dim), dtype=np.float32)
+        self._draw(np.arange(len(self.z)))
+
+    def observe(self, step: "Step") -> None:
+        ended = np.flatnonzero(step.dones)
+        if len(ended):
+            self.adaptation.infer(ended, keep=True)
+            self._draw(ended)
+
+    def exploring(self) -> np.ndarray:
+        return np.asarray(self.adaptation.n_episodes < self.n_exploration_episodes)
+
+    def deviation(self) -> np.ndarray:
+        return np.where(self.exploring()[:, None], 1.0, super().deviation())
+
+    def _draw(self, envs: np.ndarray) -> None:
+        explored, inferred = self.adaptation.noise(len(envs)), self.adaptation.sample_posterior(envs)
+        self.z[envs] = np.where(self.exploring()[envs, None], explored, inferred)

@@ -1,0 +1,87 @@
+"""How experience gets another task."""
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from sb3_htr.htr.episode_store import EpisodeStore
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.policies import BasePolicy
+
+    from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
+
+
+class HindsightDraw(NamedTuple):
+    """
+    Where m rows of a meta-batch take their transitions from, and under which tasks.
+
+    :param store: holds the transitions: the buffer's own store, or one of the relabeller's
+    :param context: (m, 2) int, half-open ranges of virtual rows of the store that contexts are drawn from
+    :param batch: (m, 2) int, the same for RL batches
+    :param tasks: (m, task_dim) float32, the hindsight tasks
+    :param is_relabelled: whether the stored rewards are those of the hindsight tasks already; if not, the buffer computes them
+        for what it draws
+    """
+
+    store: EpisodeStore
+    context: np.ndarray
+    batch: np.ndarray
+    tasks: np.ndarray
+    is_relabelled: bool
+
+
+class Relabeller(ABC):
+    """
+    Gives experience another task: eagerly, when an episode is complete (:meth:`on_episode`), or lazily, when it is drawn
+    (:meth:`draw`).
+
+    The buffer decides *whether* a row of a meta-batch is relabelled, with probability K; a relabeller decides what such a row
+    is. It owns its settings and its state. Its randomness is ``buffer.relabel_rng``, so that K = 0 changes nothing else.
+    """
+
+    buffer: "MultiTaskReplayBuffer"
+    #: Networks, for strategies that ask for values of tasks
+    policy: "BasePolicy"
+
+    def bind(self, buffer: "MultiTaskReplayBuffer") -> None:
+        """
+        :param buffer: whose episodes are relabelled; called once, before the first of them
+        """
+        self.buffer = buffer
+
+    def on_episode(self, task: int, episode: np.ndarray) -> None:
+        """
+        Called for each finished episode, after it was stored.
+
+        :param task: index of the training task that it was collected on
+        :param episode: (length, width) float32, its transitions, see :class:`sb3_htr.htr.transitions.Transitions`
+        """
+
+    @abstractmethod
+    def draw(self, tasks: np.ndarray) -> HindsightDraw:
+        """
+        :param tasks: (m,) int, training tasks of the rows of the meta-batch that are relabelled; each has episodes
+        :return: where their transitions come from
+        """
+
+    def reset(self) -> None:
+        """Forget all episodes."""
+
+    def stats(self) -> dict[str, float]:
+        """
+        :return: what is worth logging, by its key
+        """
+        return {}
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: tensors, numbers and strings, for :meth:`load_state_dict`
+        """
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: of :meth:`state_dict` of a relabeller with the same settings
+        """

@@ -1,0 +1,190 @@
+"""Episode Clustering (EC): relabelling when the data comes in."""
+
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import torch as th
+
+from sb3_htr.htr.episode_store import EpisodeStore
+from sb3_htr.htr.relabel.base import HindsightDraw, Relabeller
+from sb3_htr.htr.relabel.hindsight_task import HindsightTaskStrategy
+
+if TYPE_CHECKING:
+    from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
+
+
+class Discretiser(Protocol):
+    """Maps tasks to representatives; tasks with one representative share a hindsight buffer."""
+
+    def __call__(self, tasks: np.ndarray) -> np.ndarray:
+        """(n, task_dim) tasks to their (n, task_dim) representatives, float32."""
+        ...
+
+
+class GridDiscretiser:
+    """
+    Rounds tasks to a grid.
+
+    :param cell_size: width of a cell in each dimension; at most the radius of a goal, so that an episode that reached a goal
+        has reached the middle of its cell too
+    :raises ValueError: if a width is not positive
+    """
+
+    def __init__(self, cell_size: float | list[float]) -> None:
+        try:
+            self.cell_size = np.asarray(cell_size, dtype=np.float32)
+        except (TypeError, ValueError):
+            raise ValueError(f"cell_size is {cell_size!r}, expected positive widths.") from None
+        if not ((self.cell_size > 0) & np.isfinite(self.cell_size)).all() or self.cell_size.size == 0:
+            raise ValueError(f"cell_size is {self.cell_size.tolist()}, expected positive widths.")
+
+    def __call__(self, tasks: np.ndarray) -> np.ndarray:
+        """
+        :param tasks: (n, task_dim)
+        :return: (n, task_dim) float32, middles of their cells
+        """
+        # adding 0 turns -0 into 0, the same cell with other bytes
+        return (np.round(tasks / self.cell_size) * self.cell_size + 0).astype(np.float32)
+
+
+class EpisodeClustering(Relabeller):
+    """
+    Relabels each finished episode at once (HTR paper, B.3 and Algorithm 2), and keeps hindsight buffers of its own.
+
+    A copy of the episode, with the rewards of a discretised hindsight task, goes to the hindsight buffer of that task. A
+    relabelled row of a meta-batch is drawn as PEARL draws it, from a random hindsight buffer in place of the task's own.
+    (Algorithm 2, line 12 has the inequality inverted: B.3 swaps "according to probability K".)
+
+    Hindsight buffers need memory: it grows with their number, see :attr:`n_hindsight_buffers` and :attr:`nbytes`.
+
+    :param cell_size: grid of the task space, see :class:`GridDiscretiser`. Our choice for the Point Robot: 0.1, half the goal
+        radius
+    :param discretiser: in place of a grid
+    :param exploratory_fraction: share of the episodes of a hindsight buffer that are exploratory, i.e. were not chosen for
+        having solved its task, in [0, 1). Real buffers hold many such; B.3 found the balance to matter and gives no value, 0.3
+        is our choice
+    :param hindsight_task_strategy: which state of an episode is the hindsight task, before discretisation: ``"random"``,
+        ``"final"``, or ``"even"`` (default), of several the one whose buffer has few episodes
+    :raises ValueError: for a value that is out of its range
+    """
+
+    def __init__(
+        self,
+        cell_size: float | list[float] = 0.1,
+        discretiser: Discretiser | None = None,
+        exploratory_fraction: float = 0.3,
+        hindsight_task_strategy: HindsightTaskStrategy | str = "even",
+    ) -> None:
+        if not (isinstance(exploratory_fraction, int | float) and 0 <= exploratory_fraction < 1):
+            raise ValueError(f"exploratory_fraction is {exploratory_fraction!r}, expected a number from 0 to below 1.")
+        self.discretiser = GridDiscretiser(cell_size) if discretiser is None else discretiser
+        self.exploratory_fraction = exploratory_fraction
+        self.hindsight_task_strategy = HindsightTaskStrategy.of(hindsight_task_strategy)
+
+    def bind(self, buffer: "MultiTaskReplayBuffer") -> None:
+        """
+        :param buffer: whose episodes are relabelled
+        """
+        super().bind(buffer)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all episodes."""
+        own = self.buffer.episodes
+        self.episodes = EpisodeStore(0, own.episodes_per_task, own.episode_length, self.buffer.transitions.width)
+        self._tasks: list[np.ndarray] = []
+        self._buffer_of: dict[bytes, int] = {}
+
+    @property
+    def n_hindsight_buffers(self) -> int:
+        """Number of hindsight tasks that were reached so far, after discretisation."""
+        return self.episodes.n_tasks
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of memory that the episodes of all hindsight buffers take."""
+        return int(self.episodes.rows[:1].nbytes * self.episodes.index().task_row[-1])
+
+    def rewarded_fraction(self) -> tuple[float, float]:
+        """
+        :return: share of the stored episodes with a reward beside the task-free one, in the real and in the hindsight buffers
+        """
+        return self._rewarded(self.buffer.episodes), self._rewarded(self.episodes)
+
+    def _rewarded(self, episodes: EpisodeStore) -> float:
+        index, columns = episodes.index(), self.buffer.transitions
+        if len(index.rows) == 0:
+            return 0.0
+        rows = episodes.rows[index.rows]
+        task_part = np.abs(rows[:, columns.reward] - rows[:, columns.task_free_reward]) > 0
+        return float((np.add.reduceat(task_part, index.episode_row[:-1]) > 0).mean())
+
+    def stats(self) -> dict[str, float]:
+        """
+        :return: balance of rewarded episodes, number and memory of the hindsight buffers
+        """
+        real, hindsight = self.rewarded_fraction()
+        return {
+            "replay/rewarded_fraction_real": real,
+            "replay/rewarded_fraction_hindsight": hindsight,
+            "replay/n_hindsight_buffers": self.n_hindsight_buffers,
+            "replay/hindsight_megabytes": self.nbytes / 1e6,
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: the hindsight buffers and their tasks
+        """
+        return {"episodes": self.episodes.state_dict(), "tasks": th.from_numpy(np.array(self._tasks, dtype=np.float32))}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: of :meth:`state_dict`
+        """
+        self.episodes.load_state_dict(state["episodes"])
+        self._tasks = list(state["tasks"].numpy().copy())
+        self._buffer_of = {task.tobytes(): i for i, task in enumerate(self._tasks)}
+
+    def on_episode(self, task: int, episode: np.ndarray) -> None:
+        """
+        Put copies of the episode into hindsight buffers.
+
+        :param task: not used
+        :param episode: (length, width) float32
+        """
+        buffer, strategy = self.buffer, self.hindsight_task_strategy
+        rng = buffer.relabel_rng
+        steps = strategy.steps(np.full(strategy.n_candidates, len(episode)), rng)
+        reached = buffer.task_family.hindsight_task(buffer.transitions.trajectory(episode), steps)
+        representatives = self.discretiser(reached)
+        count = np.array([1 + self._n_episodes_of(representative) for representative in representatives])
+        self._add(representatives[strategy.choose(count[None], rng)[0]], episode)
+        # As many exploratory episodes as make up their share: this one, under a task that others reached
+        n_exploratory = self.exploratory_fraction / (1 - self.exploratory_fraction)
+        for _ in range(int(n_exploratory + rng.random())):
+            self._add(self._tasks[rng.integers(self.n_hindsight_buffers)], episode)
+
+    def _n_episodes_of(self, hindsight_task: np.ndarray) -> int:
+        buffer = self._buffer_of.get(hindsight_task.tobytes())
+        return 0 if buffer is None else int(self.episodes.n_added[buffer])
+
+    def _add(self, hindsight_task: np.ndarray, episode: np.ndarray) -> None:
+        key = hindsight_task.tobytes()
+        if key not in self._buffer_of:
+            self._buffer_of[key] = self.episodes.add_task()
+            self._tasks.append(hindsight_task)
+        relabelled = episode.copy()
+        tasks = np.broadcast_to(hindsight_task, (len(episode), len(hindsight_task)))
+        self.buffer.write_rewards(relabelled, np.arange(len(episode)), tasks)
+        self.episodes.add(self._buffer_of[key], relabelled)
+
+    def draw(self, tasks: np.ndarray) -> HindsightDraw:
+        """
+        :param tasks: (m,) int, training tasks
+        :return: a random hindsight buffer in place of each of them
+        """
+        chosen = self.buffer.relabel_rng.integers(self.n_hindsight_buffers, size=len(tasks))
+        index = self.episodes.index()
+        context = index.latest_episodes(chosen, self.buffer.context_episodes)
+        hindsight_tasks = np.stack([self._tasks[i] for i in chosen])
+        return HindsightDraw(self.episodes, context, index.all_episodes(chosen), hindsight_tasks, is_relabelled=True)

@@ -1,0 +1,58 @@
+"""Single Episode Relabelling (SER): relabelling when experience is drawn."""
+
+import numpy as np
+
+from sb3_htr.common.type_aliases import Trajectory
+from sb3_htr.htr.relabel.base import HindsightDraw, Relabeller
+from sb3_htr.htr.relabel.hindsight_task import HindsightTaskStrategy
+
+# Rows that candidates for hindsight tasks are compared with: enough to tell common from rare, in linear time
+MAX_COMPARED = 64
+
+
+class SingleEpisodeRelabelling(Relabeller):
+    """
+    ONE episode of the task's replay, ONE hindsight task that this episode reached: both context and RL batch are steps of that
+    episode with the rewards of that task (HTR paper, B.2). Needs no memory.
+
+    :param hindsight_task_strategy: which state of an episode is the hindsight task. ``"random"``: any; ``"final"``: the last;
+        ``"even"`` (default): any, those that few others resemble being more probable. The paper says "e.g., select a state
+        reached"; the default is our choice, by measurement. ``"even"`` differs from B.2 in one more thing: its candidates are
+        states of several episodes of the task, and so the choice of the task is one of the episode too
+    :param rl_batch_source: ``"episode"`` (B.2, default) draws the RL batch of a relabelled row from the same episode as its
+        context; ``"task"`` is the ablation of B.2, the RL batch comes from all of the task's replay
+    :raises ValueError: for an unknown strategy or source
+    """
+
+    def __init__(
+        self, hindsight_task_strategy: HindsightTaskStrategy | str = "even", rl_batch_source: str = "episode"
+    ) -> None:
+        self.hindsight_task_strategy = HindsightTaskStrategy.of(hindsight_task_strategy)
+        if rl_batch_source not in ("episode", "task"):
+            raise ValueError(f'rl_batch_source is {rl_batch_source!r}, expected "episode" or "task".')
+        self.rl_batch_source = rl_batch_source
+
+    def draw(self, tasks: np.ndarray) -> HindsightDraw:
+        """
+        :param tasks: (m,) int, training tasks
+        :return: for each one episode of its replay and a task that the episode reached
+        """
+        buffer, strategy = self.buffer, self.hindsight_task_strategy
+        rng, index = buffer.relabel_rng, buffer.episodes.index()
+        first, end = index.task_episode[tasks, None], index.task_episode[tasks + 1, None]
+        episode = first + (rng.random((len(tasks), strategy.n_candidates)) * (end - first)).astype(np.int64)
+        start, end = index.episode_row[episode], index.episode_row[episode + 1]
+        step = start + strategy.steps(end - start, rng)
+        reached = buffer.transitions.trajectory(buffer.episodes.rows[index.rows[step]][..., None, :])
+        hindsight_task = buffer.task_family.hindsight_task(reached, 0)
+        chosen = np.arange(len(tasks)), strategy.choose(self._count_alike(reached, hindsight_task), rng)
+        context = np.stack([start[chosen], end[chosen]], axis=1)
+        batch = context if self.rl_batch_source == "episode" else index.all_episodes(tasks)
+        return HindsightDraw(buffer.episodes, context, batch, hindsight_task[chosen], is_relabelled=False)
+
+    def _count_alike(self, reached: Trajectory, task: np.ndarray) -> np.ndarray:
+        """(n, n_candidates), how many of some other rows solve each candidate's task with their first candidate, plus 1."""
+        if task.shape[1] == 1:
+            return np.ones(task.shape[:2])
+        first = Trajectory(*(values[:MAX_COMPARED, 0] for values in reached))
+        return 1 + self.buffer.task_family.is_success(first, task[:, :, None])[..., 0].sum(axis=-1)

@@ -1,0 +1,537 @@
+"""What off-policy meta-algorithms share: rollouts that adapt, adaptation at meta-test, files and state."""
+
+import io
+import pathlib
+import pickle
+import warnings
+from collections import deque
+from collections.abc import Iterable, Iterator
+from functools import partial
+from typing import IO, Any, TypeVar, cast
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, TrainFreq
+from stable_baselines3.common.utils import check_for_correct_spaces
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.sac import SAC
+
+from sb3_htr.adaptation.adaptation import Adaptation, Step
+from sb3_htr.adaptation.agent import AdaptedAgent
+from sb3_htr.adaptation.evaluation import run_adaptation
+from sb3_htr.adaptation.explorers import Explorer, to_explorer
+from sb3_htr.adaptation.knowledge import LatentKnowledge
+from sb3_htr.adaptation.loop import adaptation_steps
+from sb3_htr.adaptation.task_bank import MAX_TASKS, TaskBank
+from sb3_htr.common import checks
+from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.random_state import get_generator_state, get_global_state, set_generator_state, set_global_state
+from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
+from sb3_htr.pearl.policies import PEARLPolicy
+
+SelfMetaAlgorithm = TypeVar("SelfMetaAlgorithm", bound="OffPolicyMetaAlgorithm")
+
+COUNTERS = ("num_timesteps", "_episode_num", "_n_updates", "_n_rollouts", "_current_progress_remaining")
+
+
+class OffPolicyMetaAlgorithm(SAC):
+    """
+    SAC whose rollouts are adaptations to training tasks and whose replay is ordered by task. A subclass adds ``train``.
+
+    :param policy: name or class of the policy
+    :param env: env of a task family (see ``htr_envs.TaskEnv``), VecEnv of such envs, or registered id
+    :param context_size: transitions per task for the context, at most
+    :param n_tasks_per_rollout: training tasks per rollout
+    :param n_episodes_per_task: episodes on each of them
+    :param explorer: chooses z at meta-test: an explorer, its name, or its name and settings
+    :param train_explorer: the same for rollouts
+    :param learning_starts: env steps with random actions before learning starts
+    :param replay_buffer_class: a MultiTaskReplayBuffer
+    :param replay_buffer_kwargs: its arguments
+    :param policy_kwargs: arguments of the policy
+    :param seed: seed of all random generators
+    :param kwargs: arguments of SAC
+    """
+
+    policy: PEARLPolicy
+    replay_buffer: MultiTaskReplayBuffer | None
+
+    def __init__(
+        self,
+        policy: str | type[PEARLPolicy],
+        env: GymEnv | str | None,
+        *,
+        context_size: int,
+        n_tasks_per_rollout: int,
+        n_episodes_per_task: int,
+        explorer: Explorer | dict[str, Any] | str,
+        train_explorer: Explorer | dict[str, Any] | str,
+        learning_starts: int,
+        replay_buffer_class: type[MultiTaskReplayBuffer] | None,
+        replay_buffer_kwargs: dict[str, Any] | None,
+        policy_kwargs: dict[str, Any] | None,
+        seed: int | None,
+        **kwargs: Any,
+    ) -> None:
+        infinity = float("inf")
+        checks.check_numbers(
+            context_size=(context_size, 1, infinity),
+            n_tasks_per_rollout=(n_tasks_per_rollout, 1, infinity),
+            n_episodes_per_task=(n_episodes_per_task, 1, infinity),
+            learning_starts=(learning_starts, 0, infinity),
+        )
+        self.explorer, self.train_explorer = to_explorer(explorer), to_explorer(train_explorer)
+        buffer_class = replay_buffer_class or MultiTaskReplayBuffer
+        checks.check_keywords("replay_buffer_kwargs", replay_buffer_kwargs or {}, buffer_class)
+        if isinstance(env, str):
+            env = make_task_vec_env(env, n_tasks_per_rollout, seed=seed)
+        if env is not None:
+            env = self._wrap_env(env)
+            checks.check_spaces(env)
+        super().__init__(
+            policy=policy,
+            env=env,  # type: ignore[arg-type]
+            learning_starts=learning_starts,
+            replay_buffer_class=buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            policy_kwargs={} if policy_kwargs is None else dict(policy_kwargs),
+            seed=seed,
+            _init_setup_model=False,
+            **kwargs,
+        )
+        # SAC adds an argument for state-dependent exploration, which is not for us: z explores
+        self.policy_kwargs.pop("use_sde")
+        checks.check_keywords("policy_kwargs", self.policy_kwargs, self.policy_class)
+        self.context_size = context_size
+        self.n_tasks_per_rollout = n_tasks_per_rollout
+        self.n_episodes_per_task = n_episodes_per_task
+        self.task_bank: TaskBank | None = None
+        # Training tasks in the order of the coming rollouts: every task once, then every task once in another order
+        self._task_queue = np.zeros(0, dtype=np.int64)
+        self._n_rollouts = 0
+        self._warned_not_adapted = False
+        # Of a training that goes on: takes effect once learn() has set everything up, which draws random numbers
+        self._pending_random: dict[str, Any] | None = None
+
+    def _setup_model(self) -> None:
+        if self.env is None:
+            # Loaded for prediction only: SB3 wants a buffer, we want no memory of it
+            self.replay_buffer = ReplayBuffer(1, self.observation_space, self.action_space)  # type: ignore[assignment]
+            super()._setup_model()
+            self.replay_buffer = None
+        else:
+            self._setup_replay(self.env)
+            super()._setup_model()
+        self.knowledge = LatentKnowledge(self.policy.latent_dim, MAX_TASKS).to(self.device)
+        self._introduce_policy()
+
+    def _setup_replay(self, env: VecEnv) -> None:
+        checks.check_is_not_normalized(env)
+        checks.check_reward_is_sparse(env)
+        family = checks.get_task_family(env)
+        buffer_class = cast(type[MultiTaskReplayBuffer], self.replay_buffer_class)
+        self.replay_buffer = buffer_class(
+            self.buffer_size,
+            self.observation_space,
+            self.action_space,
+            device=self.device,
+            n_envs=self.n_envs,
+            seed=self.seed,
+            task_family=family,
+            max_episode_steps=checks.get_max_episode_steps(env),
+            **self.replay_buffer_kwargs,
+        )
+        self.task_bank = TaskBank(family, self.replay_buffer.transitions)
+        self.replay_buffer.episode_listeners.append(self.task_bank.on_episode)
+
+    def _introduce_policy(self) -> None:
+        if self.replay_buffer is not None:
+            self.replay_buffer.relabeller.policy = self.policy
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        :param env: env of the same spaces and number of copies; its task family replaces the old one if nothing was collected
+        :param force_reset: reset before training goes on
+        """
+        super().set_env(env, force_reset)
+        assert self.env is not None
+        if self.replay_buffer is None:
+            self._setup_replay(self.env)
+            self._introduce_policy()
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """
+        :param seed: seed of python, numpy, torch, envs, rollout tasks and replay buffer
+        """
+        super().set_random_seed(seed)
+        self._rng = np.random.default_rng(seed)
+        if isinstance(self.replay_buffer, MultiTaskReplayBuffer) and seed is not None:
+            self.replay_buffer.seed(seed)
+
+    # Meta-training
+
+    def learn(
+        self: SelfMetaAlgorithm,
+        total_timesteps: int = 150_000,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 1,
+        tb_log_name: str = "PEARL",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfMetaAlgorithm:
+        """
+        Meta-train.
+
+        :param total_timesteps: env steps; the last rollout is finished
+        :param callback: called at every step
+        :param log_interval: rollouts between two logs, None for no logs
+        :param tb_log_name: name of the run for TensorBoard
+        :param reset_num_timesteps: count env steps from 0
+        :param progress_bar: show one
+        :return: self
+        """
+        return super().learn(
+            total_timesteps=total_timesteps,
+            callback=callback,
+            log_interval=log_interval,  # type: ignore[arg-type]
+            tb_log_name=tb_log_name,
+            reset_num_timesteps=reset_num_timesteps,
+            progress_bar=progress_bar,
+        )
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        result = super()._setup_learn(*args, **kwargs)
+        if self._pending_random is not None:
+            self._set_random_state(self._pending_random)
+            self._pending_random = None
+        return result
+
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        # The last rollout may go beyond the budget, and a schedule must not go below its end
+        super()._update_current_progress_remaining(min(num_timesteps, total_timesteps), total_timesteps)
+
+    def collect_rollouts(  # type: ignore[override]
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        train_freq: TrainFreq,
+        replay_buffer: MultiTaskReplayBuffer,
+        action_noise: ActionNoise | None = None,
+        learning_starts: int = 0,
+        log_interval: int | None = None,
+    ) -> RolloutReturn:
+        """
+        Adapt to ``n_tasks_per_rollout`` training tasks, one per env at a time, and store all that happens.
+
+        Each env stays on its task until every env has finished ``n_episodes_per_task`` episodes; envs whose episodes are
+        shorter go on with more of them.
+
+        :param env: training env
+        :param callback: called at every step
+        :param train_freq: not used, a rollout is whole adaptations
+        :param replay_buffer: where the steps go
+        :param action_noise: not used
+        :param learning_starts: env steps with random actions
+        :param log_interval: rollouts between two logs
+        :return: what was collected
+        """
+        assert self.task_bank is not None
+        self.policy.set_training_mode(False)
+        callback.on_rollout_start()
+        first_step, first_episode = self.num_timesteps, self._episode_num
+        continue_training = all(
+            self._adapt_to_training_tasks(env, callback, replay_buffer, learning_starts)
+            for _ in range(-(-self.n_tasks_per_rollout // env.num_envs))
+        )
+        if continue_training:
+            if self._n_rollouts == 0:
+                replay_buffer.check_reward_hook()
+            self.task_bank.update()
+            self.logger.record("rollout/train_tasks_reached", len(self.task_bank.solved))
+            callback.on_rollout_end()
+            self._n_rollouts += 1
+            if log_interval is not None and self._n_rollouts % log_interval == 0:
+                self.dump_logs()
+        return RolloutReturn(self.num_timesteps - first_step, self._episode_num - first_episode, continue_training)
+
+    def _adapt_to_training_tasks(
+        self, env: VecEnv, callback: BaseCallback, replay_buffer: MultiTaskReplayBuffer, learning_starts: int
+    ) -> bool:
+        """One task for each env. Whether a callback wants to go on."""
+        tasks = self._next_tasks(env.num_envs)
+        env.set_options([{"task_id": int(task)} for task in tasks])
+        obs = env.reset()
+        assert isinstance(obs, np.ndarray)
+        checks.check_task_ids(env)
+        replay_buffer.discard_open_episodes()
+        adaptation = self.start_adaptation(env.num_envs, self.train_explorer)
+        act = partial(self._explore, adaptation, learning_starts)
+        steps = adaptation_steps(env, adaptation, self.n_episodes_per_task, self.policy.unscale_action, act, obs)
+        while (step := self._next_step(steps, tasks)) is not None:
+            # SB3's names, for callbacks
+            rewards, dones, infos = step.rewards, step.dones, step.infos
+            self.num_timesteps += env.num_envs
+            # Give access to local variables
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+            self._update_info_buffer(infos, dones)
+            replay_buffer.add(step.observations, step.next_observations, step.actions, rewards, dones, infos)
+            self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+            self._episode_num += int(dones.sum())
+        return True
+
+    def _next_tasks(self, n: int) -> np.ndarray:
+        assert self.task_bank is not None
+        n_tasks = len(self.task_bank.task_family.train_tasks)
+        while len(self._task_queue) < n:
+            self._task_queue = np.append(self._task_queue, self._rng.permutation(n_tasks))
+        tasks, self._task_queue = self._task_queue[:n], self._task_queue[n:]
+        return tasks
+
+    def _explore(self, adaptation: Adaptation, learning_starts: int, obs: np.ndarray) -> np.ndarray:
+        """Actions of a rollout, scaled to [-1, 1]."""
+        self.policy.watch(obs)
+        if self.num_timesteps < learning_starts:
+            return self._rng.uniform(-1, 1, (len(obs), *self.action_space.shape)).astype(np.float32)  # type: ignore[misc]
+        return adaptation.act(obs, deterministic=False)
+
+    def _next_step(self, steps: Iterator[Step], tasks: np.ndarray) -> Step | None:
+        """One more step, None at the end; failures of an env say where."""
+        where = f"at env step {self.num_timesteps}, on one of the training tasks {tasks.tolist()}"
+        try:
+            return next(steps, None)
+        except ValueError as error:
+            raise ValueError(
+                f"An env failed {where} ({error}): its observations must have the shape of its observation_space."
+            ) from error
+        except (EOFError, ConnectionError) as error:
+            raise RuntimeError(
+                f"The process of an env died {where}: its own traceback is printed above. Envs in one process (vec_env dummy) "
+                "show it here."
+            ) from error
+
+    def _learn_knowledge(self, means: th.Tensor) -> None:
+        """
+        :param means: (n, latent_dim), posterior means of recent meta-batches
+        """
+        assert self.task_bank is not None
+        self.knowledge.learn(self.policy, means, self.task_bank, self.context_size)
+
+    # Meta-test
+
+    def start_adaptation(
+        self,
+        n_envs: int,
+        explorer: Explorer | dict[str, Any] | str | None = None,
+        generator: th.Generator | None = None,
+    ) -> Adaptation:
+        """
+        :param n_envs: number of tasks to adapt to side by side
+        :param explorer: an explorer, its name, or its name and settings; the model's own by default
+        :param generator: source of randomness; torch's global one by default
+        :return: chooses z and takes in what happens
+        """
+        chosen = self.explorer if explorer is None else to_explorer(explorer)
+        return Adaptation(self.policy, self.knowledge, chosen, n_envs, self.context_size, generator)
+
+    def adapt(
+        self,
+        env: gym.Env | VecEnv | str,
+        n_episodes: int = 5,
+        task: int | np.ndarray | None = None,
+        explorer: Explorer | dict[str, Any] | str | None = None,
+        deterministic: bool = True,
+        seed: int = 0,
+    ) -> AdaptedAgent:
+        """
+        Adapt to one task by trying it.
+
+        :param env: env with the task, or an id
+        :param n_episodes: episodes to adapt in. The agent then acts with the z of the best one, or with a draw from its
+            posterior where none was tried yet (explorer ``"prior"``: with a draw from the posterior over all of them)
+        :param task: index of a training task or task vector; by default the task that the env has (if it has none yet, one
+            is drawn). The env keeps it.
+        :param explorer: an explorer, its name, or its name and settings; the model's own by default
+        :param deterministic: adapt with mean actions instead of samples
+        :param seed: seed of z
+        :return: an agent for this task, with the returns of its adaptation episodes
+        :raises ValueError: for several envs, an env without tasks or with other spaces, a task that the env does not have
+        """
+        if n_episodes < 1:
+            raise ValueError(f"n_episodes is {n_episodes}, expected at least 1.")
+        vec_env = make_task_vec_env(env) if isinstance(env, str) else self._wrap_env(env, monitor_wrapper=False)
+        if vec_env.num_envs != 1:
+            raise ValueError(f"adapt() adapts to one task, but the VecEnv has {vec_env.num_envs} envs: pass a single env.")
+        checks.get_task_family(vec_env)
+        check_for_correct_spaces(vec_env, self.observation_space, self.action_space)
+        if task is None:
+            vec_env.reset()
+            task = np.array(vec_env.get_attr("task")[0])
+        vec_env.set_options({"task_id": int(task)} if np.ndim(task) == 0 else {"task": np.asarray(task, dtype=np.float32)})
+        adaptation = self.start_adaptation(1, explorer, th.Generator().manual_seed(seed))
+        record = run_adaptation(self.policy, vec_env, adaptation, n_episodes, deterministic)
+        if adaptation.best_return[0] <= 0:
+            warnings.warn(
+                f"No reward was found in {n_episodes} episodes, so the agent is not adapted: allow more, or train longer.",
+                stacklevel=2,
+            )
+        return AdaptedAgent(self.policy, adaptation.explorer.final_z()[0], record.returns[0], record.successes[0])
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        :param observation: (obs_dim,) or (n, obs_dim)
+        :param state: tuple of one array, z of each observation (n, latent_dim); without it the agent is not adapted to any
+            task, which is warned of once
+        :param episode_start: ignored: z lives longer than an episode
+        :param deterministic: mean action instead of a sample
+        :return: actions, and the state for the next call
+        """
+        if state is None and not self._warned_not_adapted:
+            self._warned_not_adapted = True
+            warnings.warn(
+                "This PEARL is not adapted to any task, so it acts with the prior mean of z. To see what it can do, use "
+                "sb3_htr.evaluate_adaptation(model, env), or evaluate_policy(model.adapt(env), env).",
+                stacklevel=2,
+            )
+        return self.policy.predict(observation, state, episode_start, deterministic)
+
+    # Files and state
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """
+        :param path: file, ``.zip`` is added to a name without suffix; it is replaced at the end or not at all
+        :param exclude: attributes to leave out
+        :param include: attributes to save that would be left out
+        """
+        if isinstance(path, io.IOBase):
+            return super().save(path, exclude, include)
+        with atomic_path(_with_suffix(path, ".zip")) as temporary:
+            super().save(temporary, exclude, include)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "knowledge", "task_bank", "_pending_random"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, variables = super()._get_torch_save_params()
+        return [*state_dicts, "knowledge"], variables
+
+    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        """
+        Save replay and what was learnt of it, as plain arrays.
+
+        :param path: file, ``.pt`` is added to a name without suffix; it is replaced at the end or not at all
+        """
+        assert self.replay_buffer is not None and self.task_bank is not None
+        state = {"replay": self.replay_buffer.state_dict(), "task_bank": self.task_bank.state_dict()}
+        if isinstance(path, io.IOBase):
+            return th.save(state, cast(IO[bytes], path))
+        with atomic_path(_with_suffix(path, ".pt")) as temporary:
+            th.save(state, temporary)
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """
+        :param path: file of ``save_replay_buffer``; reading it runs no code
+        :param truncate_last_traj: not used, only whole episodes are stored
+        :raises ValueError: if it is no such file, or one of a model with other settings
+        """
+        if self.replay_buffer is None or self.task_bank is None:
+            raise ValueError(
+                "This model has no env, so it has no replay buffer to fill: pass env=... to load, or call set_env."
+            )
+        file: Any = path if isinstance(path, io.IOBase) else _with_suffix(path, ".pt")
+        try:
+            state = th.load(file, weights_only=True)
+            replay, task_bank = state["replay"], state["task_bank"]
+        except (RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError):
+            raise ValueError(
+                f"{path} is damaged, or no replay buffer of sb3_htr: pass a file that save_replay_buffer has written."
+            ) from None
+        try:
+            self.replay_buffer.load_state_dict(replay)
+        except KeyError as missing:
+            raise ValueError(f"{path} has no {missing}: make the model with the relabeller that it was saved with.") from None
+        self.task_bank.load_state_dict(task_bank)
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        Everything that a meta-training in progress is, between two rollouts: a rollout begins with a reset of all envs, so
+        their states are not needed, only those of their random generators.
+
+        :return: tensors, numbers, strings, None, for :meth:`load_state_dict`
+        """
+        assert self.replay_buffer is not None and self.task_bank is not None and self.env is not None
+        return {
+            "parameters": self.get_parameters(),
+            "log_ent_coef": None if self.log_ent_coef is None else self.log_ent_coef.detach(),
+            "counters": {name: getattr(self, name) for name in COUNTERS},
+            "task_queue": th.from_numpy(self._task_queue.copy()),
+            "episode_infos": [{k: _tensor(v) for k, v in info.items()} for info in self.ep_info_buffer or ()],
+            "episode_successes": [_tensor(success) for success in self.ep_success_buffer or ()],
+            "replay": self.replay_buffer.state_dict(),
+            "task_bank": self.task_bank.state_dict(),
+            "random": {
+                "global": get_global_state(),
+                "model": get_generator_state(self._rng),
+                "envs": [get_generator_state(generator) for generator in self.env.get_attr("np_random")],
+            },
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        The random generators follow when ``learn(remaining steps, reset_num_timesteps=False)`` begins.
+
+        :param state: of :meth:`state_dict` of a model with the same settings
+        """
+        assert self.replay_buffer is not None and self.task_bank is not None
+        self.set_parameters(state["parameters"], exact_match=True, device=self.device)
+        if self.log_ent_coef is not None:
+            self.log_ent_coef.data.copy_(state["log_ent_coef"])
+        for name, value in state["counters"].items():
+            setattr(self, name, value)
+        self._task_queue = state["task_queue"].numpy().copy()
+        infos = [{key: _number(value) for key, value in info.items()} for info in state["episode_infos"]]
+        self.ep_info_buffer = deque(infos, maxlen=self._stats_window_size)
+        successes = [_number(success) for success in state["episode_successes"]]
+        self.ep_success_buffer = deque(successes, maxlen=self._stats_window_size)
+        self.replay_buffer.load_state_dict(state["replay"])
+        self.task_bank.load_state_dict(state["task_bank"])
+        self._pending_random = state["random"]
+
+    def _set_random_state(self, state: dict[str, Any]) -> None:
+        assert self.env is not None
+        set_global_state(state["global"])
+        set_generator_state(self._rng, state["model"])
+        for i, (generator, saved) in enumerate(zip(self.env.get_attr("np_random"), state["envs"], strict=True)):
+            set_generator_state(generator, saved)
+            self.env.set_attr("np_random", generator, indices=i)
+
+
+def _with_suffix(path: str | pathlib.Path | io.BufferedIOBase, suffix: str) -> pathlib.Path:
+    path = pathlib.Path(cast(str, path))
+    return path if path.suffix else path.with_suffix(suffix)
+
+
+def _tensor(value: Any) -> th.Tensor:
+    """A number or array, with its dtype: means of float32 numbers are other ones than those of float64."""
+    return th.from_numpy(np.array(value))
+
+
+def _number(tensor: th.Tensor) -> Any:
+    return tensor.cpu().numpy()[()]
