@@ -14,14 +14,14 @@ from stable_baselines3.common.evaluation import evaluate_policy
 
 from htr_envs import PointRobotFamily
 from sb3_htr import PEARL, evaluate_adaptation
-from sb3_htr.common.evaluation import record_adaptation
+from sb3_htr.adaptation.evaluation import record_adaptation
 from sb3_htr.common.vec_env import make_task_vec_env
-from sb3_htr.pearl.adaptation import MAX_SETBACKS, Adaptation
-from sb3_htr.pearl.context import evenly_spread
+from sb3_htr.adaptation.adaptation import MAX_SETBACKS, Adaptation
+from sb3_htr.adaptation.context import evenly_spread
 from sb3_htr.pearl.exploration import Explorer, LatentPrior
 from sb3_htr.pearl.policies import PEARLPolicy
-from sb3_htr.pearl.task_bank import TaskBank
-from sb3_htr.pearl.task_belief import KnownTasks, TaskBelief
+from sb3_htr.adaptation.task_bank import TaskBank
+from sb3_htr.adaptation.explorers.task_belief import KnownTasks, TaskBelief
 
 MakePEARL = Callable[..., PEARL]
 ROLLOUT = 4 * 3 * 20

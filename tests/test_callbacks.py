@@ -12,7 +12,7 @@ from conftest import ENV_ID
 from htr_envs import PointRobotFamily
 from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.common.callbacks import MetaEvalCallback, MetaTrialEvalCallback
+from sb3_htr.adaptation.callbacks import MetaEvalCallback, MetaTrialEvalCallback
 from sb3_htr.common.vec_env import make_task_vec_env
 
 MakePEARL = Callable[..., PEARL]

@@ -22,9 +22,9 @@ from sb3_htr.experiments import (
 )
 from sb3_htr.experiments.report import Plot, episodes_to_first_success, loss_of_stability
 from sb3_htr.experiments.runner import LOGGED, Cell, run_cell
-from sb3_htr.pearl.resume import checkpoints
+from sb3_htr.common.resume import checkpoints
 from sb3_htr.zoo import intervals
-from sb3_htr.zoo.intervals import iqm_difference, iqm_interval
+from sb3_htr.zoo.plots.intervals import iqm_difference, iqm_interval
 
 EXPERIMENTS: dict[str, tuple[Callable[[int, int], list[Cell]], Plot]] = {
     "point_robot": (point_robot.cells, report.plot_learning),

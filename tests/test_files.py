@@ -21,7 +21,7 @@ from sb3_htr import PEARL, evaluate_adaptation, load_untrusted
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr import EpisodeClustering
-from sb3_htr.pearl.files import SavesToFiles
+from sb3_htr.pearl.untrusted import SavesToFiles
 
 MakePEARL = Callable[..., PEARL]
 ROLLOUT = 4 * 3 * 20

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from htr_envs import PointRobotFamily, TargetSpeedFamily
 from sb3_htr.htr import EpisodeClustering, MultiTaskReplayBuffer
 from sb3_htr.zoo.cli import main
-from sb3_htr.zoo.yaml_values import without_code
+from sb3_htr.zoo.run.yaml_values import without_code
 
 FAMILY = PointRobotFamily(n_train_tasks=5, n_test_tasks=2, n_validation_tasks=2)
 anything = st.one_of(

@@ -10,7 +10,7 @@ from torch import nn
 
 from sb3_htr.common.linear import MIN_ROWS, Linear, with_fast_linear
 from sb3_htr.common.matmul import matmul_precision
-from sb3_htr.common.memory import keep_freed_memory
+from sb3_htr.zoo.run.memory import keep_freed_memory
 
 
 def gradients(layer: nn.Module, x: th.Tensor, loss_weight: th.Tensor) -> list[th.Tensor]:

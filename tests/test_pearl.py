@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
 from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.common.vec_env import make_task_vec_env
-from sb3_htr.pearl.task_belief import KnownTasks
+from sb3_htr.adaptation.explorers.task_belief import KnownTasks
 
 MakePEARL = Callable[..., PEARL]
 ROLLOUT = 4 * 3 * 20  # env steps of one rollout of the tiny settings

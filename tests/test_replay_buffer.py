@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from htr_envs import PointRobotFamily, Trajectory
 from sb3_htr.common.type_aliases import MultiTaskSamples
 from sb3_htr.htr.episode_store import EpisodeStore
-from sb3_htr.htr.hindsight_task import HindsightTaskStrategy, choose_rare
+from sb3_htr.htr.relabel.hindsight_task import HindsightTaskStrategy, choose_rare
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer, spread
 
 FAMILY = PointRobotFamily()

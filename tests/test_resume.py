@@ -20,7 +20,7 @@ from stable_baselines3.common.monitor import load_results
 
 from sb3_htr import PEARL
 from sb3_htr.common.checkpoint import MANIFEST, STATE, DamagedCheckpoint, read_checkpoint, write_checkpoint
-from sb3_htr.pearl.resume import checkpoints, load_latest
+from sb3_htr.common.resume import checkpoints, load_latest
 from sb3_htr.zoo.cli import main
 
 # Rollouts of 4 tasks x 3 episodes x 20 steps, 10 of them, a checkpoint after each
@@ -253,7 +253,7 @@ def test_reading_a_checkpoint_runs_no_code(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_stops_no_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import sb3_htr.pearl.resume as module
+    import sb3_htr.common.resume as module
 
     calls = []
 

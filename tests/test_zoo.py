@@ -18,8 +18,8 @@ from sb3_htr import PEARL
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr import EpisodeClustering
 from sb3_htr.zoo.cli import main
-from sb3_htr.zoo.shipped import hyperparams_file
-from sb3_htr.zoo.train import MetaExperimentManager
+from sb3_htr.zoo.run.shipped import hyperparams_file
+from sb3_htr.zoo.commands.train import MetaExperimentManager
 
 SMALL = [
     "n_tasks_per_rollout:4",

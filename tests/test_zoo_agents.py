@@ -18,14 +18,14 @@ import yaml
 from conftest import ENV_ID, TINY
 
 from sb3_htr import PEARL, evaluate_adaptation, load_untrusted
-from sb3_htr.common.evaluation import AdaptationRecord, record_adaptation
+from sb3_htr.adaptation.evaluation import AdaptationRecord, record_adaptation
 from sb3_htr.zoo import cli, model_card, window
-from sb3_htr.zoo.agents import RECORD, agent_at, agent_for
+from sb3_htr.zoo.run.agents import RECORD, agent_at, agent_for
 from sb3_htr.zoo.cli import main
-from sb3_htr.zoo.export import push_to_hub
-from sb3_htr.zoo.play import Moment, Player
-from sb3_htr.zoo.plot import check_same_settings
-from sb3_htr.zoo.shipped import shipped
+from sb3_htr.zoo.commands.export import push_to_hub
+from sb3_htr.zoo.show.play import Moment, Player
+from sb3_htr.zoo.commands.plot import check_same_settings
+from sb3_htr.zoo.run.shipped import shipped
 
 SHIPPED = shipped("trained_agents") / "htr-ser" / f"{ENV_ID}.zip"
 # Finds no agent there, so that the shipped one is taken
@@ -180,7 +180,7 @@ def test_films_that_cannot_be_made(tmp_path: Path, tiny_pearl: Callable[..., PEA
         main(["record", *NOWHERE, "-o", "film.avi"])
     with pytest.raises(ValueError, match="--every is 0"):
         main(["record", *NOWHERE, "--every", "0"])
-    monkeypatch.setattr("sb3_htr.zoo.record.MAX_GIF_FRAMES", 5)
+    monkeypatch.setattr("sb3_htr.zoo.commands.record.MAX_GIF_FRAMES", 5)
     with pytest.raises(ValueError, match="A gif holds at most 5 frames"):
         main(["record", *NOWHERE, "-o", str(tmp_path / "film.gif"), "--verbose", "0"])
     assert not list(tmp_path.iterdir()), "no half of a film is left"
@@ -197,7 +197,7 @@ def test_plot_draws_all_pictures_of_an_agent(tmp_path: Path, capsys: pytest.Capt
 def test_plot_draws_seeds_as_one_curve(
     tmp_path: Path, tiny_pearl: Callable[..., PEARL], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sb3_htr.zoo.intervals.REPS", 50)
+    monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 50)
     folders = [tmp_path / "one", tmp_path / "other"]
     for folder in folders:
         for number in (1, 2):
@@ -348,7 +348,7 @@ def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixtu
 
 
 def test_captions_know_what_was_worst(tmp_path: Path) -> None:
-    from sb3_htr.zoo.captions import Captioner
+    from sb3_htr.zoo.show.captions import Captioner
 
     captioner = Captioner()
     frame = np.zeros((101, 201, 3), dtype=np.uint8)

@@ -20,7 +20,7 @@ from sb3_htr import PEARL
 from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.zoo import optimize, search_space, train
 from sb3_htr.zoo.cli import main
-from sb3_htr.zoo.search_space import convert_pearl_params, sample_pearl_params
+from sb3_htr.zoo.run.search_space import convert_pearl_params, sample_pearl_params
 
 SMALL = ["-params", "n_tasks_per_rollout:4", "n_episodes_per_task:3", "learning_starts:240", "n_envs:4"]
 

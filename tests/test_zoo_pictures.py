@@ -12,7 +12,7 @@ from gymnasium.envs.registration import EnvSpec
 from matplotlib.figure import Figure
 
 from sb3_htr import PEARL
-from sb3_htr.common.evaluation import AdaptationRecord
+from sb3_htr.adaptation.evaluation import AdaptationRecord
 from sb3_htr.zoo import curves, intervals, plots
 from sb3_htr.zoo.cli import main
 

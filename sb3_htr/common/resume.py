@@ -4,7 +4,7 @@ import shutil
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
@@ -12,10 +12,6 @@ from stable_baselines3.common.logger import TensorBoardOutputFormat
 
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checkpoint import DamagedCheckpoint, read_checkpoint, write_checkpoint
-from sb3_htr.pearl.state import get_env_state, get_training_state, set_env_state, set_training_state
-
-if TYPE_CHECKING:
-    from sb3_htr.pearl.pearl import PEARL
 
 # What is recorded but not written yet
 LOGGER_STATE = ("name_to_value", "name_to_count", "name_to_excluded")
@@ -23,7 +19,7 @@ LOGGER_STATE = ("name_to_value", "name_to_count", "name_to_excluded")
 
 @runtime_checkable
 class HasState(Protocol):
-    """A callback that remembers something."""
+    """A model or callback whose memory can be put into a file."""
 
     def state_dict(self) -> dict[str, Any]:
         """Nested dicts and lists of tensors, numbers, strings."""
@@ -110,35 +106,31 @@ class CheckpointCallback(BaseCallback):
         self._pending: dict[str, Any] | None = None
         self.stopping = self._stopped = False
 
-    def restore(self, model: "PEARL", state: dict[str, Any]) -> None:
+    def restore(self, model: HasState, state: dict[str, Any]) -> None:
         """
         Put a training that was just set up, with the same settings, where a checkpoint was.
 
         :param model: to be trained by ``learn(remaining steps, reset_num_timesteps=False)`` with this callback
         :param state: of :func:`load_latest`
         """
-        set_training_state(model, state["training"])
-        self._restore_callbacks(state["callbacks"])
-        # Setting up the training makes a logger, and resets the envs, which draws random numbers
+        model.load_state_dict(state["model"])
+        for callback, remembered in zip((self, *self.companions), state["callbacks"], strict=True):
+            callback.n_calls = remembered["n_calls"]
+            if isinstance(callback, HasState):
+                callback.load_state_dict(remembered["state"])
+        self._last_calls = self.n_calls
+        # Setting up the training makes a logger
         self._pending = state
 
     def stop(self) -> None:
         """Save a checkpoint before the next rollout, and end the training there."""
         self.stopping = True
 
-    def _restore_callbacks(self, states: list[dict[str, Any]]) -> None:
-        for callback, state in zip((self, *self.companions), states, strict=True):
-            callback.n_calls = state["n_calls"]
-            if isinstance(callback, HasState):
-                callback.load_state_dict(state["state"])
-        self._last_calls = self.n_calls
-
     def _monitor_files(self) -> dict[str, int]:
         return {path.name: path.stat().st_size for path in self.run.glob("*.monitor.csv")}
 
     def _on_training_start(self) -> None:
         if self._pending is not None:
-            set_env_state(self._pearl, self._pending["envs"])
             for name in LOGGER_STATE:
                 getattr(self.logger, name).update(self._pending["logger"][name])
             for output, folder in zip(self._tensorboards(), self._pending["tensorboard_folders"], strict=True):
@@ -150,10 +142,6 @@ class CheckpointCallback(BaseCallback):
 
     def _tensorboards(self) -> list[TensorBoardOutputFormat]:
         return [output for output in self.logger.output_formats if isinstance(output, TensorBoardOutputFormat)]
-
-    @property
-    def _pearl(self) -> "PEARL":
-        return cast("PEARL", self.model)
 
     def _on_step(self) -> bool:
         return not self._stopped
@@ -189,8 +177,7 @@ class CheckpointCallback(BaseCallback):
 
     def _state(self) -> dict[str, Any]:
         return {
-            "training": get_training_state(self._pearl),
-            "envs": get_env_state(self._pearl),
+            "model": cast(HasState, self.model).state_dict(),
             "logger": {name: _plain(getattr(self.logger, name)) for name in LOGGER_STATE},
             "callbacks": [
                 {"n_calls": callback.n_calls, "state": callback.state_dict() if isinstance(callback, HasState) else None}

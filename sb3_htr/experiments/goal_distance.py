@@ -10,8 +10,8 @@ import numpy as np
 from htr_envs import PointRobotFamily
 from sb3_htr.experiments.command import run_experiment
 from sb3_htr.experiments.runner import Cell
-from sb3_htr.zoo.curves import band, finish
-from sb3_htr.zoo.plots import COLOURS
+from sb3_htr.zoo.plots.curves import band, finish
+from sb3_htr.zoo.plots.adaptation import COLOURS
 
 ENV_ID = "SparsePointRobot-v0"
 # Steps of an episode for each distance: time to get there, and as long again

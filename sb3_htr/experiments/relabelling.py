@@ -9,9 +9,9 @@ import numpy as np
 
 from sb3_htr.experiments.command import run_experiment
 from sb3_htr.experiments.runner import Cell
-from sb3_htr.zoo.curves import band, finish
-from sb3_htr.zoo.intervals import iqm_interval
-from sb3_htr.zoo.plots import COLOURS
+from sb3_htr.zoo.plots.curves import band, finish
+from sb3_htr.zoo.plots.intervals import iqm_interval
+from sb3_htr.zoo.plots.adaptation import COLOURS
 
 ENV_ID = "SparsePointRobot-v0"
 # The paper's sweep, and no relabelling

@@ -13,9 +13,9 @@ import numpy as np
 
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.experiments.runner import LOGGED, Cell
-from sb3_htr.zoo.curves import band, finish
-from sb3_htr.zoo.intervals import iqm_difference, iqm_interval
-from sb3_htr.zoo.plots import COLOURS
+from sb3_htr.zoo.plots.curves import band, finish
+from sb3_htr.zoo.plots.intervals import iqm_difference, iqm_interval
+from sb3_htr.zoo.plots.adaptation import COLOURS
 
 RESULTS = Path(__file__).parents[2] / "results"
 

@@ -14,9 +14,9 @@ import numpy as np
 
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.common.evaluation import evaluate_adaptation
-from sb3_htr.pearl.resume import checkpoints
-from sb3_htr.zoo.agents import agent_at, find_run
+from sb3_htr.adaptation.evaluation import evaluate_adaptation
+from sb3_htr.common.resume import checkpoints
+from sb3_htr.zoo.run.agents import agent_at, find_run
 
 # Means over the training of what HTR paper, B.2 reasons with
 LOGGED = ("relabelled_fraction", "rl_reward_mean", "rl_zero_reward_fraction")

@@ -1,17 +1,20 @@
-"""``sb3-htr train``: rl_zoo3's training with PEARL in it, and with evaluations that adapt."""
+"""rl_zoo3's experiment manager, for runs of task envs."""
 
-import argparse
 import importlib
 import json
+import os
 import signal
 import sys
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout
 from datetime import datetime, timezone
+from functools import partial
 from importlib.metadata import version
+from io import StringIO
 from pathlib import Path
+from pprint import pprint
 from types import ModuleType
 from typing import Any
 
@@ -21,7 +24,7 @@ import rl_zoo3.train
 from rl_zoo3 import exp_manager
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
-from rl_zoo3.utils import ALGOS, SimpleLinearSchedule
+from rl_zoo3.utils import ALGOS, SimpleLinearSchedule, get_latest_run_id
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import LinearSchedule
@@ -29,34 +32,22 @@ from stable_baselines3.common.vec_env import VecEnv
 
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr import PEARL
+from sb3_htr.adaptation.callbacks import MetaEvalCallback
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.common.callbacks import MetaEvalCallback, MetaTrialEvalCallback, ProgressCallback
 from sb3_htr.common.checks import check_keywords, check_numbers
-from sb3_htr.common.memory import keep_freed_memory
+from sb3_htr.common.resume import CheckpointCallback, checkpoints, cut_monitor_files, load_latest
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.pearl.divergence import DivergedError
-from sb3_htr.pearl.resume import CheckpointCallback, checkpoints, cut_monitor_files, load_latest
-from sb3_htr.zoo.agents import find_run
-from sb3_htr.zoo.search_space import convert_pearl_params, sample_pearl_params
-from sb3_htr.zoo.shipped import hyperparams_file
-from sb3_htr.zoo.yaml_values import without_code
+from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback, ProgressCallback
+from sb3_htr.zoo.run.method import DEFAULT, get_method, merged
+from sb3_htr.zoo.run.search_space import convert_pearl_params, sample_pearl_params
+from sb3_htr.zoo.run.yaml_values import without_code
 
 PACKAGES = ("sb3_htr", "stable_baselines3", "gymnasium", "rl_zoo3", "torch", "numpy", "mujoco")
 # What a YAML file may have beside the arguments of PEARL
-ZOO_SETTINGS = ("n_envs", "n_timesteps", "normalize", "env_wrapper", "vec_env_wrapper", "callback", "env_kwargs")
+ZOO_SETTINGS = ("n_envs", "n_timesteps", "method", "env_wrapper", "vec_env_wrapper", "callback", "env_kwargs")
 # Tasks that an evaluation adapts to side by side
 N_EVAL_ENVS = 20
-HELP = """sb3-htr train: rl_zoo3's train (its arguments follow) with PEARL and evaluations that adapt to validation tasks.
-
-examples:
-  sb3-htr train --env SparsePointRobot-v0 -P
-  sb3-htr train --env SparsePointRobot-v0 -f runs --seed 1 -params gamma:0.95 "policy_kwargs:{'latent_dim':3}"
-  sb3-htr train --resume runs/pearl/SparsePointRobot-v0_1
-
-defaults here: --algo pearl -conf hyperparams/pearl.yml (of this package) --num-threads 1 --save-freq 20000
-beside rl_zoo3's: --resume RUN  go on with a run from its latest checkpoint, exactly; takes no other arguments
-no effect here: --eval-episodes and --n-eval-envs (an evaluation adapts to each validation task once, in 20 episodes)
-"""
 
 
 class MetaExperimentManager(ExperimentManager):
@@ -64,40 +55,55 @@ class MetaExperimentManager(ExperimentManager):
     rl_zoo3's manager, with task envs stepped as one batch and env arguments of the YAML that reach the evaluation too.
     """
 
-    # Folder of the run that goes on, None for a new one
-    resumed: Path | None = None
+    def __init__(self, *args: Any, method: str | None = None, resumed: Path | None = None, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._method_name = method
+        self.resumed = resumed
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """
-        rl_zoo3's; but settings of a trial (``--trial-id``) join those of the file where both are dicts, instead of replacing
-        them all, and trial 0 can be asked for.
+        Those of the env in the YAML file, joined with those of the method, of a trial (``--trial-id``) and of the command line
+        (``-params``): later ones win, and dicts are joined in depth.
 
         :return: hyperparameters, and the same sorted to be saved
         """
         if self.n_timesteps != -1:
             check_numbers(n_timesteps=(self.n_timesteps, 1, float("inf")))
-        trial_id, self.trial_id = self.trial_id, None
-        hyperparams, saved = super().read_hyperparameters()
-        if self.storage and self.study_name and trial_id is not None:
-            try:
-                trial = self.load_trial(self.storage, self.study_name, trial_id)
-            except (KeyError, IndexError):
-                raise ValueError(
-                    f"{self.storage} has no study {self.study_name!r} with a trial {trial_id}: `sb3-htr optimize` prints both."
-                ) from None
-            for key in trial.keys() - (self.custom_hyperparams or {}).keys():
-                value, given = trial[key], hyperparams.get(key)
-                hyperparams[key] = {**given, **value} if isinstance(value, dict) and isinstance(given, dict) else value
-            saved = OrderedDict(sorted(hyperparams.items()))
-            print(f"With those of trial {trial_id}: {trial}")
+        given, trial_id = self.custom_hyperparams or {}, self.trial_id
+        self.custom_hyperparams, self.trial_id = None, None
+        with redirect_stdout(StringIO()):  # it prints what is not all of it
+            hyperparams, _ = super().read_hyperparameters()
+        self.method = get_method(self._method_name or hyperparams.pop("method", DEFAULT))
+        hyperparams = merged(without_code(hyperparams), self.method.hyperparams())
+        hyperparams = merged(merged(hyperparams, self._trial(trial_id)), given)
+        saved = OrderedDict(sorted(hyperparams.items()))
+        print(f"Method {self.method.name}: {self.config} has the settings of the env. With those of the command line:")
+        pprint(dict(saved))
         return hyperparams, saved
+
+    def _trial(self, trial_id: int | None) -> dict[str, Any]:
+        if not (self.storage and self.study_name and trial_id is not None):
+            return {}
+        try:
+            trial: dict[str, Any] = self.load_trial(self.storage, self.study_name, trial_id)
+        except (KeyError, IndexError):
+            raise ValueError(
+                f"{self.storage} has no study {self.study_name!r} with a trial {trial_id}: `sb3-htr optimize` prints both."
+            ) from None
+        print(f"With those of trial {trial_id}: {trial}")
+        return trial
 
     def _preprocess_hyperparams(
         self, hyperparams: dict[str, Any]
     ) -> tuple[dict[str, Any], Callable[..., Any] | None, list[BaseCallback], Callable[..., Any] | None]:
+        if "normalize" in hyperparams:
+            raise ValueError(
+                "normalize asks for SB3's VecNormalize, which is not saved with the model: write policy_kwargs: "
+                "{normalize_observations: true} in its place."
+            )
         check_keywords("PEARL", hyperparams, PEARL, also=ZOO_SETTINGS)
         check_numbers(n_envs=(hyperparams.get("n_envs", 1), 1, float("inf")))
-        processed = super()._preprocess_hyperparams(without_code(hyperparams))
+        processed = super()._preprocess_hyperparams(hyperparams)
         if self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = dict(self.env_kwargs)
         return processed
@@ -130,22 +136,25 @@ class MetaExperimentManager(ExperimentManager):
             monitor_dir=None if eval_env or no_log else self.save_path,
             env_kwargs=self.eval_env_kwargs if eval_env else self.env_kwargs,
         )
-        if self.vec_env_wrapper is not None:
-            env = self.vec_env_wrapper(env)
-        return self._maybe_normalize(env, eval_env)
+        return env if self.vec_env_wrapper is None else self.vec_env_wrapper(env)
 
     def create_log_folder(self) -> None:
         """Make the run's folder, or take the one of the run that goes on; a search has none."""
+        self.log_path = f"{self.log_folder}/{self.method.name}/"
         if self.optimize_hyperparameters:
             return
         if self.tensorboard_log:
             importlib.import_module("tensorboard")  # missing, it should be said before anything is written
-        if self.resumed is not None:
+        if self.resumed is None:
+            number = get_latest_run_id(self.log_path, self.env_name) + 1
+            unique = self.save_path.removeprefix(os.path.join(self.log_folder, self.algo)).partition("_")[2].partition("_")[1:]
+            self.save_path = os.path.join(self.log_path, f"{self.env_name}_{number}{''.join(unique)}")
+        else:
             self.save_path = str(self.resumed)
-            self.params_path = f"{self.save_path}/{self.env_name}"
             folder, self._checkpoint = load_latest(self.resumed)
             cut_monitor_files(self.resumed, folder, self._checkpoint["monitor_files"])
             print(f"Going on from {folder}")
+        self.params_path = f"{self.save_path}/{self.env_name}"
         super().create_log_folder()
 
     def create_callbacks(self) -> None:
@@ -192,6 +201,7 @@ class MetaExperimentManager(ExperimentManager):
         :raises optuna.TrialPruned: for hyperparameters that promise little or diverge
         """
         try:
+            HYPERPARAMS_SAMPLER[self.algo] = lambda trial, *_: merged(self._hyperparams, sample_pearl_params(trial))
             return super().objective(trial)
         except DivergedError as error:
             print(f"Trial {trial.number} is pruned: {error}")
@@ -213,6 +223,7 @@ class MetaExperimentManager(ExperimentManager):
         super()._save_config(saved_hyperparams)
         run = {
             "env_id": self.env_name.gym_id,
+            "method": self.method.name,
             "env_kwargs": self.env_kwargs,
             "gym_packages": self.args.gym_packages,
             "seed": self.seed,
@@ -235,24 +246,6 @@ def _is_installed(name: str) -> bool:
     return True
 
 
-def register() -> None:
-    """Make PEARL known to rl_zoo3, in this process."""
-    ALGOS["pearl"] = PEARL
-    HYPERPARAMS_SAMPLER["pearl"] = sample_pearl_params
-    HYPERPARAMS_CONVERTER["pearl"] = convert_pearl_params
-    # rl_zoo3 looks these names up when it needs them
-    replaced: dict[ModuleType, dict[str, type]] = {
-        exp_manager: {
-            "EvalCallback": MetaEvalCallback,
-            "TrialEvalCallback": MetaTrialEvalCallback,
-            "CheckpointCallback": CheckpointCallback,
-        },
-        rl_zoo3.train: {"ExperimentManager": MetaExperimentManager},
-    }
-    for module, classes in replaced.items():
-        vars(module).update(classes)
-
-
 @contextmanager
 def _soft_interrupt(checkpointing: CheckpointCallback | None) -> Iterator[None]:
     """Let the first Ctrl-C end the training before the next rollout, with a checkpoint, and the second one at once."""
@@ -272,45 +265,31 @@ def _soft_interrupt(checkpointing: CheckpointCallback | None) -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _arguments(argv: Sequence[str]) -> tuple[list[str], Path | None]:
-    """Those for rl_zoo3, and the run to go on with."""
-    parser = argparse.ArgumentParser(prog="sb3-htr train", add_help=False, allow_abbrev=False)
-    parser.add_argument("--resume", type=Path)
-    parser.add_argument("--algo", default="pearl")
-    args, rest = parser.parse_known_args(argv)
-    if args.algo != "pearl":
-        raise ValueError(f"--algo is {args.algo!r}, but sb3-htr trains pearl: `python -m rl_zoo3.train` has SB3's algorithms.")
-    if args.resume is None:
-        if not {"-h", "--help"} & set(rest) and not any(argument.split("=")[0] == "--env" for argument in rest):
-            raise ValueError("--env is missing: give the id of a task env, as in `sb3-htr train --env SparsePointRobot-v0`.")
-        # Later arguments win, so these are defaults. One thread: two runs on two cores must not fight for them.
-        defaults = ["--algo", "pearl", "-conf", str(hyperparams_file()), "--num-threads", "1", "--save-freq", "20000"]
-        return [*defaults, *rest], None
-    if rest:
-        raise ValueError(f"train --resume goes on with the run's own arguments: leave {' '.join(rest)} away.")
-    run = find_run(args.resume)
-    record = json.loads((run / "run.json").read_text())
-    return [*record["arguments"], "--seed", str(record["seed"])], run
-
-
-def main(argv: Sequence[str]) -> None:
+def run_rl_zoo(program: str, arguments: list[str], method: str | None = None, resumed: Path | None = None) -> None:
     """
-    :param argv: arguments of rl_zoo3's train; the algorithm is PEARL, the YAML is this package's unless given. Or ``--resume``
-        and the folder of a run, which goes on from its latest checkpoint
+    rl_zoo3's train with PEARL in it.
+
+    :param program: name for its messages
+    :param arguments: for it
+    :param method: name of the method; that of the YAML file by default
+    :param resumed: folder of the run that goes on, None for a new one
     """
-    register()
-    if {"-h", "--help"} & set(argv):
-        print(HELP)
-    keep_freed_memory()
-    arguments, run = _arguments(argv)
-    before, sys.argv = sys.argv, ["sb3-htr train", *arguments]
-    MetaExperimentManager.resumed = run
+    ALGOS["pearl"] = PEARL
+    HYPERPARAMS_CONVERTER["pearl"] = convert_pearl_params
+    manager = partial(MetaExperimentManager, method=method, resumed=resumed)
+    # rl_zoo3 looks these names up when it needs them
+    replaced: dict[ModuleType, dict[str, Any]] = {
+        exp_manager: {
+            "EvalCallback": MetaEvalCallback,
+            "TrialEvalCallback": MetaTrialEvalCallback,
+            "CheckpointCallback": CheckpointCallback,
+        },
+        rl_zoo3.train: {"ExperimentManager": manager},
+    }
+    for module, classes in replaced.items():
+        vars(module).update(classes)
+    before, sys.argv = sys.argv, [program, *arguments]
     try:
         rl_zoo3.train.train()
-    except (NameError, SyntaxError) as error:
-        raise ValueError(
-            f"{error}: the values of -params and --env-kwargs are Python, with strings in quotes, as in \"explorer:'prior'\"."
-        ) from error
     finally:
         sys.argv = before
-        MetaExperimentManager.resumed = None

@@ -5,11 +5,11 @@ from typing import Any
 
 from rl_zoo3.utils import get_class_by_name
 
-from sb3_htr.htr import EpisodeClustering, MultiTaskReplayBuffer
+from sb3_htr.htr import MultiTaskReplayBuffer
 
 # Settings that may be a string in rl_zoo3, and then are Python
-EVALUATED = ("policy_kwargs", "replay_buffer_kwargs", "normalize", "monitor_kwargs")
-BUFFERS = {"EpisodeClustering": EpisodeClustering, "MultiTaskReplayBuffer": MultiTaskReplayBuffer}
+EVALUATED = ("policy_kwargs", "replay_buffer_kwargs", "monitor_kwargs")
+BUFFERS = {"MultiTaskReplayBuffer": MultiTaskReplayBuffer}
 
 
 def without_code(hyperparams: dict[str, Any]) -> dict[str, Any]:

@@ -7,9 +7,9 @@ import numpy as np
 
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checks import get_task_family
-from sb3_htr.common.evaluation import AdaptationRecord, record_adaptation
-from sb3_htr.zoo.arguments import add_adaptation_arguments, add_agent_arguments, make_parser, parse
-from sb3_htr.zoo.plots import plot_adaptation_curve, plot_adaptation_paths, start_position
+from sb3_htr.adaptation.evaluation import AdaptationRecord, record_adaptation
+from sb3_htr.zoo.commands.arguments import add_adaptation_arguments, add_agent_arguments, make_parser, parse
+from sb3_htr.zoo.plots.adaptation import plot_adaptation_curve, plot_adaptation_paths, start_position
 
 EXAMPLE = """  sb3-htr evaluate logs
   sb3-htr evaluate --env SparsePointRobot-v0 --explorer prior"""

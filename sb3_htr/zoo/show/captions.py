@@ -3,7 +3,7 @@
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from sb3_htr.zoo.play import Moment
+from sb3_htr.zoo.show.play import Moment
 
 # Okabe and Ito's colours, as in the plots
 INK, PALE, SOLVED, MISSED = "#222222", "#dddddd", "#0072B2", "#E69F00"

@@ -12,12 +12,12 @@ import torch as th
 
 from sb3_htr import PEARL
 from sb3_htr.common.checks import get_task_family
-from sb3_htr.common.evaluation import AdaptationRecord, run_adaptation
-from sb3_htr.zoo.agents import TrainedAgent, find_runs
-from sb3_htr.zoo.arguments import add_adaptation_arguments, add_agent_arguments, chosen_agent, make_parser
-from sb3_htr.zoo.curves import Curve, plot_curves
-from sb3_htr.zoo.latent import plot_latent_space
-from sb3_htr.zoo.plots import plot_adaptation_curve, plot_adaptation_paths, start_position
+from sb3_htr.adaptation.evaluation import AdaptationRecord, run_adaptation
+from sb3_htr.zoo.run.agents import TrainedAgent, find_runs
+from sb3_htr.zoo.commands.arguments import add_adaptation_arguments, add_agent_arguments, chosen_agent, make_parser
+from sb3_htr.zoo.plots.curves import Curve, plot_curves
+from sb3_htr.zoo.plots.latent import plot_latent_space
+from sb3_htr.zoo.plots.adaptation import plot_adaptation_curve, plot_adaptation_paths, start_position
 
 EXAMPLE = """  sb3-htr plot --env SparsePointRobot-v0                  an agent that comes with the package
   sb3-htr plot runs/htr runs/sparse -l HTR "no relabelling"    the runs in a folder are the seeds of its curve

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_htr.pearl.exploration import Explorer
-from sb3_htr.zoo.agents import TrainedAgent, agent_at, agent_for, import_packages
+from sb3_htr.zoo.run.agents import TrainedAgent, agent_at, agent_for, import_packages
 
 TASK_SETS = ("test", "validation", "train")
 

@@ -11,10 +11,10 @@ from typing import Any
 from sb3_htr import PEARL
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checks import get_task_family
-from sb3_htr.common.evaluation import record_adaptation
-from sb3_htr.zoo.agents import RECORD, TrainedAgent
-from sb3_htr.zoo.arguments import add_agent_arguments, make_parser, parse
-from sb3_htr.zoo.model_card import model_card, training_command
+from sb3_htr.adaptation.evaluation import record_adaptation
+from sb3_htr.zoo.run.agents import RECORD, TrainedAgent
+from sb3_htr.zoo.commands.arguments import add_agent_arguments, make_parser, parse
+from sb3_htr.zoo.run.model_card import model_card, training_command
 
 EXAMPLE = """  sb3-htr export runs/pearl/SparsePointRobot-v0_1 -o my_agent
   sb3-htr export runs --film --push-to-hub USER/pearl-SparsePointRobot-v0

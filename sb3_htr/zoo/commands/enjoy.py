@@ -9,13 +9,13 @@ import numpy as np
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_htr.common.checks import get_task_family
-from sb3_htr.zoo.agents import TrainedAgent
-from sb3_htr.zoo.arguments import add_adaptation_arguments, add_agent_arguments, make_parser, parse
-from sb3_htr.zoo.play import Moment, Player, heading, line, summary
+from sb3_htr.zoo.run.agents import TrainedAgent
+from sb3_htr.zoo.commands.arguments import add_adaptation_arguments, add_agent_arguments, make_parser, parse
+from sb3_htr.zoo.show.play import Moment, Player, heading, line, summary
 
 if TYPE_CHECKING:
-    from sb3_htr.zoo.captions import Captioner
-    from sb3_htr.zoo.window import Window
+    from sb3_htr.zoo.show.captions import Captioner
+    from sb3_htr.zoo.show.window import Window
 
 EXAMPLE = """  sb3-htr enjoy --env SparsePointRobot-v0              an agent that comes with the package, or yours in logs/
   sb3-htr enjoy runs/pearl/SparsePointRobot-v0_1 --task 3 7
@@ -128,8 +128,8 @@ def _open_window(agent: TrainedAgent, fps: float | None) -> "tuple[Window, Capti
         print(f"Numbers only: {agent.env_id} cannot draw itself, 'rgb_array' is not in its metadata['render_modes'].")
         return None, None
     try:
-        from sb3_htr.zoo.captions import Captioner
-        from sb3_htr.zoo.window import Window
+        from sb3_htr.zoo.show.captions import Captioner
+        from sb3_htr.zoo.show.window import Window
 
         return Window(f"sb3-htr enjoy {agent.env_id}", fps or agent.make_env().metadata.get("render_fps", 30)), Captioner()
     except ModuleNotFoundError as error:

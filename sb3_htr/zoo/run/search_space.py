@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from sb3_htr.htr.hindsight_task import KEY_TO_HINDSIGHT_TASK_STRATEGY
+from sb3_htr.htr import HindsightTaskStrategy
 
 if TYPE_CHECKING:
     import optuna
@@ -11,15 +11,13 @@ if TYPE_CHECKING:
 NET_ARCHS = {"small": [64, 64], "medium": [128, 128], "paper": [300, 300, 300]}
 # HTR paper, A.2
 RELABEL_PROBABILITIES = (0.1, 0.3, 0.5, 0.8, 1.0)
+STRATEGIES = [strategy.value for strategy in HindsightTaskStrategy]
 ENCODER_ARCHS = {"small": [64, 64], "medium": [128, 128], "paper": [200, 200, 200]}
 
 
-def sample_pearl_params(trial: "optuna.Trial", n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+def sample_pearl_params(trial: "optuna.Trial") -> dict[str, Any]:
     """
     :param trial: draws the values
-    :param n_actions: not used
-    :param n_envs: not used
-    :param additional_args: rl_zoo3's; has the settings of the replay buffer that are not searched through
     :return: arguments of PEARL
     """
     params: dict[str, Any] = {
@@ -36,11 +34,9 @@ def sample_pearl_params(trial: "optuna.Trial", n_actions: int, n_envs: int, addi
         "net_arch": trial.suggest_categorical("net_arch", list(NET_ARCHS)),
         "encoder_arch": trial.suggest_categorical("encoder_arch", list(ENCODER_ARCHS)),
         "relabel_probability": trial.suggest_categorical("relabel_probability", RELABEL_PROBABILITIES),
-        "hindsight_task_strategy": trial.suggest_categorical("hindsight_task_strategy", list(KEY_TO_HINDSIGHT_TASK_STRATEGY)),
+        "hindsight_task_strategy": trial.suggest_categorical("hindsight_task_strategy", STRATEGIES),
     }
-    converted = convert_pearl_params(params)
-    buffer = {**additional_args.get("her_kwargs", {}), **converted["replay_buffer_kwargs"]}
-    return {**converted, "replay_buffer_kwargs": buffer}
+    return convert_pearl_params(params)
 
 
 def convert_pearl_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
@@ -57,5 +53,8 @@ def convert_pearl_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
         "net_arch": NET_ARCHS[params.pop("net_arch")],
         "encoder_arch": ENCODER_ARCHS[params.pop("encoder_arch")],
     }
-    converted["replay_buffer_kwargs"] = {name: params.pop(name) for name in ("relabel_probability", "hindsight_task_strategy")}
+    converted["replay_buffer_kwargs"] = {
+        "relabel_probability": params.pop("relabel_probability"),
+        "relabeller": {"hindsight_task_strategy": params.pop("hindsight_task_strategy")},
+    }
     return {**converted, **params}

@@ -9,10 +9,10 @@ import numpy as np
 from PIL import Image
 
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.zoo.arguments import add_agent_arguments, make_parser, parse
-from sb3_htr.zoo.captions import Captioner
-from sb3_htr.zoo.enjoy import add_task_arguments, can_be_drawn, watch
-from sb3_htr.zoo.play import Moment
+from sb3_htr.zoo.commands.arguments import add_agent_arguments, make_parser, parse
+from sb3_htr.zoo.show.captions import Captioner
+from sb3_htr.zoo.commands.enjoy import add_task_arguments, can_be_drawn, watch
+from sb3_htr.zoo.show.play import Moment
 
 EXAMPLE = """  sb3-htr record --env SparsePointRobot-v0                       SparsePointRobot-v0.mp4
   sb3-htr record runs -o adaptation.gif --task 2 --n-episodes 6

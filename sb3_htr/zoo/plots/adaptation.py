@@ -13,7 +13,7 @@ from matplotlib.patches import Circle
 
 from htr_envs import Trajectory
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.common.evaluation import AdaptationRecord
+from sb3_htr.adaptation.evaluation import AdaptationRecord
 
 # Okabe and Ito's colours, told apart by all kinds of colour vision
 COLOURS = ["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999"]

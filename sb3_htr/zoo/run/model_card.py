@@ -6,7 +6,7 @@ from typing import Any
 import yaml
 from huggingface_hub import EvalResult, ModelCardData
 
-from sb3_htr.common.evaluation import AdaptationRecord
+from sb3_htr.adaptation.evaluation import AdaptationRecord
 
 TAGS = (
     "deep-reinforcement-learning",

@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr import PEARL
 from sb3_htr.common.vec_env import make_task_vec_env
-from sb3_htr.zoo.shipped import shipped
+from sb3_htr.zoo.run.shipped import shipped
 
 # Record of a run: in its folder, and in an exported model file
 RECORD = "run.json"

@@ -1,0 +1,66 @@
+"""``sb3-htr train``: rl_zoo3's training with PEARL in it, and with evaluations that adapt."""
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from sb3_htr.zoo.run.agents import find_run
+from sb3_htr.zoo.run.manager import run_rl_zoo
+from sb3_htr.zoo.run.memory import keep_freed_memory
+from sb3_htr.zoo.run.method import get_method
+from sb3_htr.zoo.run.shipped import hyperparams_file
+
+HELP = """sb3-htr train: rl_zoo3's train (its arguments follow) with PEARL and evaluations that adapt to validation tasks.
+
+examples:
+  sb3-htr train --env SparsePointRobot-v0 -P
+  sb3-htr train --env SparsePointRobot-v0 --method htr-ec -f runs --seed 1
+  sb3-htr train --env SparsePointRobot-v0 -params gamma:0.95 "policy_kwargs:{'latent_dim':3}"
+  sb3-htr train --resume runs/htr-ser/SparsePointRobot-v0_1
+
+defaults here: --algo pearl -conf hyperparams/pearl.yml (of this package) --num-threads 1 --save-freq 20000
+beside rl_zoo3's:
+  --method NAME  htr-ser (default), htr-ec, pearl-dense, pearl-sparse, or one of these with -prior behind it: PEARL's own protocol
+  --resume RUN   go on with a run from its latest checkpoint, exactly; takes no other arguments
+no effect here: --eval-episodes and --n-eval-envs (an evaluation adapts to each validation task once, in 20 episodes)
+"""
+
+
+def main(argv: Sequence[str]) -> None:
+    """
+    :param argv: arguments of rl_zoo3's train; the algorithm is PEARL, the YAML is this package's unless given. Or ``--resume``
+        and the folder of a run, which goes on from its latest checkpoint
+    """
+    parser = argparse.ArgumentParser(prog="sb3-htr train", add_help=False, allow_abbrev=False)
+    parser.add_argument("--resume", type=Path)
+    parser.add_argument("--method")
+    parser.add_argument("--algo", default="pearl")
+    args, rest = parser.parse_known_args(argv)
+    wants_help = bool({"-h", "--help"} & set(rest))
+    if wants_help:
+        print(HELP)
+    if args.algo != "pearl":
+        raise ValueError(f"--algo is {args.algo!r}, but sb3-htr trains pearl: `python -m rl_zoo3.train` has SB3's algorithms.")
+    if args.method is not None:
+        get_method(args.method)
+    run: Path | None = None
+    if args.resume is not None:
+        if rest or args.method:
+            raise ValueError(f"train --resume goes on with the run's own arguments: leave {' '.join(rest) or '--method'} away.")
+        run = find_run(args.resume)
+        record = json.loads((run / "run.json").read_text())
+        arguments, args.method = [*record["arguments"], "--seed", str(record["seed"])], record["method"]
+    else:
+        if not wants_help and not any(argument.split("=")[0] == "--env" for argument in rest):
+            raise ValueError("--env is missing: give the id of a task env, as in `sb3-htr train --env SparsePointRobot-v0`.")
+        # Later arguments win, so these are defaults. One thread: two runs on two cores must not fight for them.
+        defaults = ["--algo", "pearl", "-conf", str(hyperparams_file()), "--num-threads", "1", "--save-freq", "20000"]
+        arguments = [*defaults, *rest]
+    keep_freed_memory()
+    try:
+        run_rl_zoo("sb3-htr train", arguments, args.method, run)
+    except (NameError, SyntaxError) as error:
+        raise ValueError(
+            f"{error}: the values of -params and --env-kwargs are Python, with strings in quotes, as in \"explorer:'prior'\"."
+        ) from error

@@ -1,0 +1,88 @@
+"""Callbacks that only runs of the command line need."""
+
+import os
+from pathlib import Path
+from typing import Any, Protocol
+
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import CSVOutputFormat
+
+from sb3_htr.adaptation.callbacks import MetaEvalCallback
+
+
+class ProgressCallback(BaseCallback):
+    """
+    Writes what the algorithm logs to a CSV file too, wherever else it goes.
+
+    :param path: file
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        super().__init__()
+        self.path = os.fspath(path)
+        self._written: dict[str, Any] = {"keys": [], "text": ""}
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: what was written so far
+        """
+        return {"keys": list(self._output.keys), "text": Path(self.path).read_text()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: of :meth:`state_dict`; to be set before the training starts
+        """
+        self._written = state
+
+    def _on_training_start(self) -> None:
+        self._output = CSVOutputFormat(self.path)
+        self._output.keys = list(self._written["keys"])
+        self._output.file.write(self._written["text"])
+        self._output.file.flush()
+        self.logger.output_formats.append(self._output)
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_training_end(self) -> None:
+        # rl_zoo3 may end the training of a callback a second time
+        if self._output in self.logger.output_formats:
+            self.logger.output_formats.remove(self._output)
+            self._output.close()
+
+
+class TrialResult(Protocol):
+    """The part of an Optuna trial that :class:`MetaTrialEvalCallback` uses."""
+
+    def report(self, value: float, step: int) -> None:
+        """Report an intermediate value."""
+        ...
+
+    def should_prune(self) -> bool:
+        """Whether the trial is hopeless."""
+        ...
+
+
+class MetaTrialEvalCallback(MetaEvalCallback):
+    """
+    :class:`MetaEvalCallback` for a trial of a hyperparameter search; has the attributes of rl_zoo3's ``TrialEvalCallback``.
+
+    :param eval_env: env of the task family
+    :param trial: told of every evaluation, and asked whether to go on
+    :param kwargs: as for :class:`MetaEvalCallback`
+    """
+
+    def __init__(self, eval_env: Any, trial: TrialResult, **kwargs: Any) -> None:
+        super().__init__(eval_env, **{"verbose": 0, **kwargs})
+        self.trial = trial
+        self.eval_idx = 0
+        self.is_pruned = False
+
+    def _on_step(self) -> bool:
+        n_evaluations = len(self.returns)
+        continue_training = super()._on_step()
+        if len(self.returns) > n_evaluations:
+            self.eval_idx += 1
+            self.trial.report(self.last_mean_reward, self.eval_idx)
+            self.is_pruned = self.trial.should_prune()
+        return continue_training and not self.is_pruned
