@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 import gymnasium
 import numpy as np
 
-from htr_envs.locomotion_family import ARENA, LocomotionFamily
 from htr_envs.mujoco_dynamics import DoubleArray, MujocoDynamics, mujoco  # which says so where MuJoCo is missing
 from htr_envs.mujoco_env import RENDER_MODES, MujocoTaskEnv, MujocoTaskVectorEnv
+from htr_envs.semicircle_goals import LOCOMOTION_ARENA, LocomotionFamily
 from htr_envs.task_env import BoolArray, FloatArray
 
 MODEL = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "ant.xml"
@@ -59,7 +59,7 @@ class AntDynamics(MujocoDynamics):
     def __init__(
         self, ctrl_cost_weight: float, contact_cost_weight: float, healthy_reward: float, reset_noise_scale: float
     ) -> None:
-        positions = [ARENA, ARENA, 10.0, 1.0, 1.0, 1.0, 1.0, *[np.pi] * 8]
+        positions = [LOCOMOTION_ARENA, LOCOMOTION_ARENA, 10.0, 1.0, 1.0, 1.0, 1.0, *[np.pi] * 8]
         velocities = [100.0] * 14
         super().__init__(_low_gear_ant(), reset_noise_scale, np.array(positions + velocities, dtype=np.float32))
         self.ctrl_cost_weight = np.float32(ctrl_cost_weight)

@@ -9,8 +9,7 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from htr_envs.rendering import draw_target_speed
-from htr_envs.task_env import BoolArray, FloatArray, TaskEnv, TaskFamily, Trajectory, at_step, check_reward_type
-from htr_envs.task_split import split_evenly
+from htr_envs.task_env import BoolArray, FloatArray, TaskEnv, TaskFamily, Trajectory, at_step, check_reward_type, split_evenly
 from htr_envs.task_vector_env import TaskVectorEnv
 
 FRICTION = np.float32(0.95)

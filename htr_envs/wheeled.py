@@ -7,9 +7,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from htr_envs.locomotion_family import ARENA, LocomotionFamily
 from htr_envs.mujoco_dynamics import DoubleArray, MujocoDynamics, mujoco  # which says so where MuJoCo is missing
 from htr_envs.mujoco_env import RENDER_MODES, MujocoTaskEnv, MujocoTaskVectorEnv
+from htr_envs.semicircle_goals import LOCOMOTION_ARENA, LocomotionFamily
 from htr_envs.task_env import BoolArray, FloatArray
 
 MODEL = Path(__file__).parent / "assets" / "wheeled.xml"
@@ -30,7 +30,7 @@ class WheeledDynamics(MujocoDynamics):
     envs_per_thread = 32
 
     def __init__(self, ctrl_cost_weight: float, reset_noise_scale: float) -> None:
-        bounds = [ARENA, ARENA, 1.0, 1.0, TOP_SPEED, TOP_SPEED, TOP_TURN_RATE, TOP_SPEED, TOP_SPEED]
+        bounds = [LOCOMOTION_ARENA, LOCOMOTION_ARENA, 1.0, 1.0, TOP_SPEED, TOP_SPEED, TOP_TURN_RATE, TOP_SPEED, TOP_SPEED]
         super().__init__(mujoco.MjSpec.from_file(str(MODEL)), reset_noise_scale, np.array(bounds, dtype=np.float32))
         self.ctrl_cost_weight = np.float32(ctrl_cost_weight)
 
