@@ -3,14 +3,17 @@
 from gymnasium.envs.registration import register
 
 from htr_envs.check_task_env import check_task_env
-from htr_envs.locomotion_family import LocomotionFamily
+from htr_envs.dynamics import Dynamics, DynamicsEnv, DynamicsVectorEnv
 from htr_envs.point_robot import PointRobotEnv, PointRobotFamily, PointRobotVectorEnv
-from htr_envs.semicircle_goals import SemicircleGoalFamily
+from htr_envs.semicircle_goals import LocomotionFamily, SemicircleGoalFamily
 from htr_envs.target_speed import TargetSpeedEnv, TargetSpeedFamily, TargetSpeedVectorEnv
 from htr_envs.task_env import TaskEnv, TaskFamily, Trajectory, at_step, check_reward_type
 from htr_envs.task_vector_env import TaskVectorEnv
 
 __all__ = [
+    "Dynamics",
+    "DynamicsEnv",
+    "DynamicsVectorEnv",
     "LocomotionFamily",
     "PointRobotEnv",
     "PointRobotFamily",

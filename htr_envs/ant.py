@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 import gymnasium
 import numpy as np
 
-from htr_envs.locomotion_family import ARENA, LocomotionFamily
+from htr_envs.dynamics import DynamicsEnv, DynamicsVectorEnv
 from htr_envs.mujoco_dynamics import DoubleArray, MujocoDynamics, mujoco  # which says so where MuJoCo is missing
-from htr_envs.mujoco_env import RENDER_MODES, MujocoTaskEnv, MujocoTaskVectorEnv
+from htr_envs.semicircle_goals import LOCOMOTION_ARENA, LocomotionFamily
 from htr_envs.task_env import BoolArray, FloatArray
 
 MODEL = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "ant.xml"
@@ -44,8 +44,10 @@ def _calm_down(spec: mujoco.MjSpec) -> None:
 
 
 class AntDynamics(MujocoDynamics):
-    """The robot of :class:`AntEnv`.
+    """The robots of :class:`AntEnv`.
 
+    :param num_envs: how many ants.
+    :param n_threads: how many threads step them, see :class:`htr_envs.mujoco_dynamics.MujocoDynamics`.
     :param ctrl_cost_weight: weight of the control cost.
     :param contact_cost_weight: weight of the contact cost.
     :param healthy_reward: reward of each step that ends healthy.
@@ -57,11 +59,16 @@ class AntDynamics(MujocoDynamics):
     envs_per_thread = 4
 
     def __init__(
-        self, ctrl_cost_weight: float, contact_cost_weight: float, healthy_reward: float, reset_noise_scale: float
+        self,
+        num_envs: int,
+        n_threads: int | None,
+        ctrl_cost_weight: float,
+        contact_cost_weight: float,
+        healthy_reward: float,
+        reset_noise_scale: float,
     ) -> None:
-        positions = [ARENA, ARENA, 10.0, 1.0, 1.0, 1.0, 1.0, *[np.pi] * 8]
-        velocities = [100.0] * 14
-        super().__init__(_low_gear_ant(), reset_noise_scale, np.array(positions + velocities, dtype=np.float32))
+        bounds = [*[LOCOMOTION_ARENA] * 2, 10.0, *[1.0] * 4, *[np.pi] * 8, *[100.0] * 14]
+        super().__init__(num_envs, n_threads, _low_gear_ant(), reset_noise_scale, np.array(bounds, dtype=np.float32))
         self.ctrl_cost_weight = np.float32(ctrl_cost_weight)
         self.contact_cost_weight = np.float32(contact_cost_weight)
         self.healthy_reward = np.float32(healthy_reward)
@@ -93,7 +100,23 @@ class AntDynamics(MujocoDynamics):
         )
 
 
-class AntEnv(MujocoTaskEnv):
+def _ants(
+    num_envs: int,
+    n_threads: int | None,
+    /,
+    ctrl_cost_weight: float = 0.005,
+    contact_cost_weight: float = 5e-4,
+    healthy_reward: float = 0.05,
+    reset_noise_scale: float = 0.01,
+    goal_radius: float = 0.4,
+    **family_kwargs: Any,
+) -> tuple[LocomotionFamily, AntDynamics]:
+    # the first two by position alone: a single env has no argument n_threads, and so refuses it
+    family = LocomotionFamily(goal_radius=goal_radius, **family_kwargs)
+    return family, AntDynamics(num_envs, n_threads, ctrl_cost_weight, contact_cost_weight, healthy_reward, reset_noise_scale)
+
+
+class AntEnv(DynamicsEnv):
     """
     ## Description
 
@@ -217,24 +240,13 @@ class AntEnv(MujocoTaskEnv):
     - v0: first version
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 20}  # type: ignore[misc]
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 20}  # type: ignore[misc]
 
-    def __init__(
-        self,
-        reward_type: str = "sparse",
-        render_mode: str | None = None,
-        ctrl_cost_weight: float = 0.005,
-        contact_cost_weight: float = 5e-4,
-        healthy_reward: float = 0.05,
-        reset_noise_scale: float = 0.01,
-        goal_radius: float = 0.4,
-        **family_kwargs: Any,
-    ) -> None:
-        dynamics = AntDynamics(ctrl_cost_weight, contact_cost_weight, healthy_reward, reset_noise_scale)
-        super().__init__(LocomotionFamily(goal_radius=goal_radius, **family_kwargs), dynamics, reward_type, render_mode)
+    def __init__(self, reward_type: str = "sparse", render_mode: str | None = None, **kwargs: Any) -> None:
+        super().__init__(*_ants(1, 1, **kwargs), reward_type, render_mode)
 
 
-class AntVectorEnv(MujocoTaskVectorEnv):
+class AntVectorEnv(DynamicsVectorEnv):
     """Many ants that step together, in native threads; see :class:`AntEnv` for what they do.
 
     :param num_envs: how many ants.
@@ -242,12 +254,7 @@ class AntVectorEnv(MujocoTaskVectorEnv):
     :param reward_type: reward of ``step``, ``"sparse"`` or ``"dense"``.
     :param n_threads: how many threads step the ants; the results do not depend on it. None for ``OMP_NUM_THREADS`` if that
         is set, else one for each CPU that this process may use, but for no more than have enough to do.
-    :param ctrl_cost_weight: weight of the control cost.
-    :param contact_cost_weight: weight of the contact cost.
-    :param healthy_reward: reward of each step that ends healthy.
-    :param reset_noise_scale: noise of the starting state.
-    :param goal_radius: a goal is reached where the distance to it is smaller than this, at most 1.
-    :param family_kwargs: other arguments of :class:`htr_envs.LocomotionFamily`.
+    :param kwargs: the other arguments of :class:`AntEnv`, but for ``render_mode``.
     """
 
     def __init__(
@@ -256,13 +263,6 @@ class AntVectorEnv(MujocoTaskVectorEnv):
         max_episode_steps: int | None = 200,
         reward_type: str = "sparse",
         n_threads: int | None = None,
-        ctrl_cost_weight: float = 0.005,
-        contact_cost_weight: float = 5e-4,
-        healthy_reward: float = 0.05,
-        reset_noise_scale: float = 0.01,
-        goal_radius: float = 0.4,
-        **family_kwargs: Any,
+        **kwargs: Any,
     ) -> None:
-        dynamics = AntDynamics(ctrl_cost_weight, contact_cost_weight, healthy_reward, reset_noise_scale)
-        family = LocomotionFamily(goal_radius=goal_radius, **family_kwargs)
-        super().__init__(family, dynamics, num_envs, max_episode_steps, reward_type, n_threads)
+        super().__init__(*_ants(num_envs, n_threads, **kwargs), max_episode_steps, reward_type)

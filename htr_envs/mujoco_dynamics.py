@@ -1,4 +1,4 @@
-"""MuJoCo dynamics of many copies of one robot, stepped by native threads.
+"""Dynamics in MuJoCo: many copies of one robot, stepped by native threads.
 
 A single env is a batch of one copy. Everything that is computed from a state is computed by the same array code for any number
 of copies, and a state alone determines the next one, so single and batched envs agree bit for bit.
@@ -7,7 +7,8 @@ of copies, and a state alone determines the next one, so single and batched envs
 from __future__ import annotations
 
 import os
-from abc import ABC, abstractmethod
+import sys
+from abc import abstractmethod
 from typing import Any, ClassVar
 
 import numpy as np
@@ -15,6 +16,8 @@ from gymnasium import spaces
 from gymnasium.error import DependencyNotInstalled
 from numpy.typing import NDArray
 
+from htr_envs.dynamics import Dynamics
+from htr_envs.semicircle_goals import SemicircleGoalFamily
 from htr_envs.task_env import BoolArray, FloatArray
 
 try:
@@ -26,19 +29,26 @@ except ImportError as error:
 DoubleArray = NDArray[np.float64]
 
 FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
+FRAME_WIDTH, FRAME_HEIGHT = 640, 400
+# From behind the start, looking down on the semicircle of goals
+CAMERA = {"lookat": np.array([0.0, 0.9, 0.0]), "distance": 4.8, "azimuth": 90.0, "elevation": -45.0}
 
 
-class MujocoDynamics(ABC):
-    """A MuJoCo model with what an env has to know of it; pure functions of arrays with one row for each copy.
+class MujocoDynamics(Dynamics[SemicircleGoalFamily]):
+    """Copies of a robot that is a MuJoCo model, and what an env has to know of it.
 
     A state is a row (time, qpos, qvel). The solver starts cold in every step: what it remembers of the last step would be part
-    of a state otherwise.
+    of a state otherwise. The threads are started by the first step, the renderer by the first picture. They are neither copied
+    nor pickled: a copy starts its own.
 
+    :param num_envs: how many copies.
+    :param n_threads: how many threads step them; the results do not depend on it. None for ``OMP_NUM_THREADS`` if that is set,
+        else one for each CPU that this process may use, but for no more than have enough to do.
     :param spec: the model. The goal's disc and the start's are added to it, which are seen and never felt.
     :param reset_noise_scale: half the width of the uniform noise on the starting positions, and standard deviation of the
         normal noise on the starting velocities.
     :param observation_bounds: observations are clipped at plus and minus these numbers, shape (obs_dim,).
-    :raises ValueError: if the noise is negative.
+    :raises ValueError: if the noise is negative or another number smaller than 1.
     """
 
     frame_skip: ClassVar[int]
@@ -48,21 +58,98 @@ class MujocoDynamics(ABC):
     envs_per_thread: ClassVar[int]
     """With fewer copies for each thread, waking the threads takes longer than they save (measured)."""
 
-    def __init__(self, spec: mujoco.MjSpec, reset_noise_scale: float, observation_bounds: FloatArray) -> None:
+    states: DoubleArray
+
+    def __init__(
+        self,
+        num_envs: int,
+        n_threads: int | None,
+        spec: mujoco.MjSpec,
+        reset_noise_scale: float,
+        observation_bounds: FloatArray,
+    ) -> None:
         if not reset_noise_scale >= 0.0:
             raise ValueError(f"reset_noise_scale is {reset_noise_scale}, expected a number from 0 on.")
+        if n_threads is None:
+            n_threads = min(available_threads(), max(1, num_envs // self.envs_per_thread))
+        if n_threads < 1:
+            raise ValueError(f"n_threads is {n_threads}: pass at least 1, or None for as many as there are CPUs.")
         # a state that is not finite is not replaced by the first one: the episode ends
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART | mujoco.mjtDisableBit.mjDSBL_AUTORESET
         _add_discs(spec)
         self.model = spec.compile()
+        observation_space = spaces.Box(-observation_bounds, observation_bounds, dtype=np.float32)
+        super().__init__(num_envs, observation_space, spaces.Box(-1.0, 1.0, (self.model.nu,), np.float32))
+        self.n_threads = min(num_envs, n_threads)
         self.reset_noise_scale = reset_noise_scale
-        self.observation_space = spaces.Box(-observation_bounds, observation_bounds, dtype=np.float32)
-        self.action_space = spaces.Box(-1.0, 1.0, (self.model.nu,), np.float32)
+        n_state = mujoco.mj_stateSize(self.model, FULL_PHYSICS)
+        self.states = np.zeros((num_envs, n_state))
+        # arrays that MuJoCo reads and writes, made once
+        self._controls = np.zeros((num_envs, self.frame_skip, self.model.nu))
+        self._next_states = np.zeros((num_envs, self.frame_skip, n_state))
+        self._sensors = np.zeros((num_envs, self.frame_skip, self.model.nsensordata))
+        self._rollout: tuple[Rollout, list[mujoco.MjData]] | None = None
+        self._renderer: tuple[Any, mujoco.MjData] | None = None
 
-    @property
-    def n_state(self) -> int:
-        """Length of a state."""
-        return int(mujoco.mj_stateSize(self.model, FULL_PHYSICS))
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_rollout": None, "_renderer": None}
+
+    def reset(self, indices: NDArray[np.int64], rng: np.random.Generator) -> FloatArray:
+        self.states[indices] = self.start_states(len(indices), rng)
+        return self.observe(self.states[indices])
+
+    def step(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        if self._rollout is None:
+            # with one thread the calling one does the work
+            threads = Rollout(nthread=self.n_threads if self.n_threads > 1 else 0)
+            self._rollout = threads, [mujoco.MjData(self.model) for _ in range(self.n_threads)]
+        rollout, data = self._rollout
+        actions = np.clip(actions, -1.0, 1.0)
+        self._controls[:] = actions[:, None]
+        rollout.rollout(
+            [self.model] * self.num_envs,
+            data,
+            self.states,
+            self._controls,
+            nstep=self.frame_skip,
+            state=self._next_states,
+            sensordata=self._sensors,
+            skip_checks=True,
+        )
+        self.states[:] = self._next_states[:, -1]
+        rewards = self.task_free_reward(actions, self.states, self._sensors[:, -1])
+        return self.observe(self.states), rewards, self.terminated(self.states)
+
+    def render(
+        self, task_family: SemicircleGoalFamily, task: FloatArray, path: DoubleArray, render_mode: str
+    ) -> NDArray[np.uint8] | None:
+        """Draw the robot, the start and the goal, which is a disc of the goal radius.
+
+        :return: picture (400, 640, 3), uint8; None with ``"human"``.
+        """
+        if self._renderer is None:
+            # imported here: who never renders needs no OpenGL
+            from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
+
+            if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+                # gymnasium would try to open a window first, which ends the process where there is no screen
+                os.environ.setdefault("MUJOCO_GL", "egl")
+            self.model.geom("goal").size[0] = task_family.goal_radius
+            data = mujoco.MjData(self.model)  # of its own: a picture changes nothing in the simulation
+            self._renderer = MujocoRenderer(self.model, data, dict(CAMERA), FRAME_WIDTH, FRAME_HEIGHT, camera_id=-1), data
+        renderer, data = self._renderer
+        mujoco.mj_setState(self.model, data, path[-1], FULL_PHYSICS)
+        data.mocap_pos[0, :2] = task
+        mujoco.mj_forward(self.model, data)
+        frame: NDArray[np.uint8] | None = renderer.render(render_mode)
+        return frame
+
+    def close(self) -> None:
+        """End the threads and close the window, if there is one."""
+        for opened in (self._rollout, self._renderer):
+            if opened is not None:
+                opened[0].close()
+        self._rollout = self._renderer = None
 
     @property
     def control_step(self) -> float:
@@ -70,11 +157,11 @@ class MujocoDynamics(ABC):
         return float(self.frame_skip * self.model.opt.timestep)
 
     def positions(self, states: DoubleArray) -> DoubleArray:
-        """Generalised positions (n, nq) in states (n, n_state), a view."""
+        """Generalised positions (n, nq) in states (n, state_dim), a view."""
         return states[:, 1 : 1 + self.model.nq]
 
     def velocities(self, states: DoubleArray) -> DoubleArray:
-        """Generalised velocities (n, nv) in states (n, n_state), a view."""
+        """Generalised velocities (n, nv) in states (n, state_dim), a view."""
         return states[:, 1 + self.model.nq : 1 + self.model.nq + self.model.nv]
 
     def start_states(self, n: int, rng: np.random.Generator) -> DoubleArray:
@@ -82,9 +169,9 @@ class MujocoDynamics(ABC):
 
         :param n: how many.
         :param rng: the only source of randomness.
-        :return: states, shape (n, n_state).
+        :return: states, shape (n, state_dim).
         """
-        states = np.zeros((n, self.n_state))
+        states = np.zeros((n, self.states.shape[1]))
         position_noise = rng.uniform(-self.reset_noise_scale, self.reset_noise_scale, (n, self.model.nq))
         position_noise[:, : self.n_exact_positions] = 0.0
         self.positions(states)[:] = self._start_position() + position_noise
@@ -94,7 +181,7 @@ class MujocoDynamics(ABC):
     def observe(self, states: DoubleArray) -> FloatArray:
         """What the agent sees.
 
-        :param states: shape (n, n_state).
+        :param states: shape (n, state_dim).
         :return: observations in the observation space, also of a state that is not finite, shape (n, obs_dim).
         """
         observations = np.nan_to_num(self._observe(states).astype(np.float32))
@@ -103,7 +190,7 @@ class MujocoDynamics(ABC):
     def terminated(self, states: DoubleArray) -> BoolArray:
         """Where an episode ends.
 
-        :param states: shape (n, n_state).
+        :param states: shape (n, state_dim).
         :return: which states are unhealthy or not finite, shape (n,).
         """
         # a number that is not finite makes the sum so, too
@@ -114,7 +201,7 @@ class MujocoDynamics(ABC):
         """The part of the reward that depends on no task.
 
         :param actions: clipped to the action space, shape (n, act_dim).
-        :param states: after the step, shape (n, n_state).
+        :param states: after the step, shape (n, state_dim).
         :param sensors: at the last physics step, shape (n, nsensordata).
         :return: rewards, shape (n,).
         """
@@ -138,77 +225,6 @@ def _add_discs(spec: mujoco.MjSpec) -> None:
     goal = spec.worldbody.add_body(name="goal", mocap=True)
     goal.add_geom(name="goal", size=[1.0, 0.002, 0.0], rgba=[0.90, 0.62, 0.0, 0.7], **seen_only)
     spec.worldbody.add_geom(name="start", size=[0.05, 0.002, 0.0], rgba=[0.0, 0.0, 0.0, 1.0], **seen_only)
-
-
-class MujocoBatch:
-    """States of some copies of a robot, which step together.
-
-    The threads are started by the first step. They are neither copied nor pickled: a copy starts its own.
-
-    :param dynamics: the robot.
-    :param n: how many copies.
-    :param n_threads: how many threads step them; the results do not depend on it.
-    """
-
-    def __init__(self, dynamics: MujocoDynamics, n: int, n_threads: int) -> None:
-        self.dynamics = dynamics
-        self.n_threads = min(n, n_threads)
-        model = dynamics.model
-        self.states: DoubleArray = np.zeros((n, dynamics.n_state))
-        # arrays that MuJoCo reads and writes, made once
-        self._controls = np.zeros((n, dynamics.frame_skip, model.nu))
-        self._next_states = np.zeros((n, dynamics.frame_skip, dynamics.n_state))
-        self._sensors = np.zeros((n, dynamics.frame_skip, model.nsensordata))
-        self._rollout: Rollout | None = None
-        self._data: list[mujoco.MjData] = []
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_rollout": None, "_data": []}
-
-    def reset(self, indices: NDArray[np.int64], rng: np.random.Generator) -> FloatArray:
-        """Put some copies in start states.
-
-        :param indices: which copies, shape (n,).
-        :param rng: the only source of randomness.
-        :return: their observations, shape (n, obs_dim).
-        """
-        self.states[indices] = self.dynamics.start_states(len(indices), rng)
-        return self.dynamics.observe(self.states[indices])
-
-    def step(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Move all copies by one control step.
-
-        :param actions: not clipped, shape (n, act_dim).
-        :return: observations (n, obs_dim), task-free rewards (n,), which copies terminate (n,).
-        """
-        if self._rollout is None:
-            # with one thread the calling one does the work
-            self._rollout = Rollout(nthread=self.n_threads if self.n_threads > 1 else 0)
-            self._data = [mujoco.MjData(self.dynamics.model) for _ in range(self.n_threads)]
-        actions = np.clip(actions, -1.0, 1.0)
-        self._controls[:] = actions[:, None]
-        self._rollout.rollout(
-            [self.dynamics.model] * len(self.states),
-            self._data,
-            self.states,
-            self._controls,
-            nstep=self.dynamics.frame_skip,
-            state=self._next_states,
-            sensordata=self._sensors,
-            skip_checks=True,
-        )
-        self.states[:] = self._next_states[:, -1]
-        return (
-            self.dynamics.observe(self.states),
-            self.dynamics.task_free_reward(actions, self.states, self._sensors[:, -1]),
-            self.dynamics.terminated(self.states),
-        )
-
-    def close(self) -> None:
-        """End the threads."""
-        if self._rollout is not None:
-            self._rollout.close()
-        self._rollout, self._data = None, []
 
 
 def available_threads() -> int:

@@ -8,28 +8,13 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from htr_envs.rendering import draw_point_robot
+from htr_envs.dynamics import Dynamics, DynamicsEnv, DynamicsVectorEnv
+from htr_envs.rendering import BLUE, ORANGE, PALE_ORANGE, Canvas
 from htr_envs.semicircle_goals import SemicircleGoalFamily
-from htr_envs.task_env import BoolArray, FloatArray, TaskEnv
-from htr_envs.task_vector_env import TaskVectorEnv
+from htr_envs.task_env import BoolArray, FloatArray
 
 ARENA = 10.0
 STEP_SIZE = np.float32(0.1)
-RENDER_MODES = ("rgb_array",)
-
-
-def _move(positions: FloatArray, actions: FloatArray) -> FloatArray:
-    # the walls are out of reach in 20 steps; they keep the observation's bounds true for any time limit
-    moved: FloatArray = np.clip(positions + STEP_SIZE * np.clip(actions, -1.0, 1.0), -ARENA, ARENA)
-    return moved
-
-
-def _observation_space() -> spaces.Box:
-    return spaces.Box(-ARENA, ARENA, (2,), np.float32)
-
-
-def _action_space() -> spaces.Box:
-    return spaces.Box(-1.0, 1.0, (2,), np.float32)
 
 
 class PointRobotFamily(SemicircleGoalFamily):
@@ -47,7 +32,44 @@ class PointRobotFamily(SemicircleGoalFamily):
         super().__init__(ARENA, goal_distance, goal_radius, **task_sets)
 
 
-class PointRobotEnv(TaskEnv):
+class PointRobotDynamics(Dynamics[PointRobotFamily]):
+    """The robots of :class:`PointRobotEnv`; their states are their positions.
+
+    :param num_envs: how many robots.
+    """
+
+    def __init__(self, num_envs: int) -> None:
+        super().__init__(num_envs, spaces.Box(-ARENA, ARENA, (2,), np.float32), spaces.Box(-1.0, 1.0, (2,), np.float32))
+        self.states = np.zeros((num_envs, 2), dtype=np.float32)
+
+    def reset(self, indices: NDArray[np.int64], rng: np.random.Generator) -> FloatArray:
+        self.states[indices] = 0.0
+        return self.states[indices]
+
+    def step(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        # the walls are out of reach in 20 steps; they keep the observation's bounds true for any time limit
+        self.states = np.clip(self.states + STEP_SIZE * np.clip(actions, -1.0, 1.0), -ARENA, ARENA)
+        return self.states, np.zeros(self.num_envs, dtype=np.float32), np.zeros(self.num_envs, dtype=np.bool_)
+
+    def render(self, task_family: PointRobotFamily, task: FloatArray, path: FloatArray, render_mode: str) -> NDArray[np.uint8]:
+        """Draw the arena, the semicircle of possible goals, the goal, filled strongly while the robot is in it, and the path.
+
+        :return: picture (400, 400, 3), uint8.
+        """
+        distance, radius = task_family.goal_distance, task_family.goal_radius
+        # 20 steps lead at most 2 along each axis: a robot of that episode length never leaves the picture
+        canvas = Canvas(max(2.2, 1.1 * distance + radius))
+        canvas.circle((0.0, 0.0), distance, 3, PALE_ORANGE, upper_half=True)
+        canvas.axes()
+        reached = bool(np.hypot(*(path[-1] - task)) < radius)
+        canvas.disc(task, radius, ORANGE, 1.0 if reached else 0.5)
+        canvas.circle(task, radius, 2, ORANGE)
+        canvas.path(path)
+        canvas.legend([("GOAL", ORANGE), ("START", None), ("ROBOT", BLUE)])
+        return canvas.image()
+
+
+class PointRobotEnv(DynamicsEnv):
     """
     ## Description
 
@@ -130,37 +152,13 @@ class PointRobotEnv(TaskEnv):
     - v0: first version
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # type: ignore[misc]
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}  # type: ignore[misc]
 
     def __init__(self, reward_type: str = "sparse", render_mode: str | None = None, **family_kwargs: Any) -> None:
-        if render_mode is not None and render_mode not in RENDER_MODES:
-            raise ValueError(f"render_mode is {render_mode!r}, but only 'rgb_array' exists: pass it or None.")
-        super().__init__(PointRobotFamily(**family_kwargs), reward_type)
-        self.observation_space = _observation_space()
-        self.action_space = _action_space()
-        self.render_mode = render_mode
-        self._path: list[FloatArray] = []
-
-    def _reset_state(self) -> FloatArray:
-        self._path = [np.zeros(2, dtype=np.float32)]
-        return self._path[0]
-
-    def _step_state(self, action: FloatArray) -> tuple[FloatArray, float, bool]:
-        self._path.append(_move(self._path[-1], action))
-        return self._path[-1], 0.0, False
-
-    def render(self) -> NDArray[np.uint8] | None:
-        """Draw the arena, the goal of the current episode and the path so far.
-
-        :return: picture (400, 400, 3), uint8; None without a render mode.
-        """
-        if self.render_mode is None:
-            return None
-        assert isinstance(self.task_family, PointRobotFamily)
-        return draw_point_robot(np.stack(self._path), self.task, self.task_family.goal_distance, self.task_family.goal_radius)
+        super().__init__(PointRobotFamily(**family_kwargs), PointRobotDynamics(1), reward_type, render_mode)
 
 
-class PointRobotVectorEnv(TaskVectorEnv):
+class PointRobotVectorEnv(DynamicsVectorEnv):
     """Many point robots that step together; see :class:`PointRobotEnv` for what they do.
 
     :param num_envs: how many robots.
@@ -172,14 +170,4 @@ class PointRobotVectorEnv(TaskVectorEnv):
     def __init__(
         self, num_envs: int = 1, max_episode_steps: int | None = 20, reward_type: str = "sparse", **family_kwargs: Any
     ) -> None:
-        family = PointRobotFamily(**family_kwargs)
-        super().__init__(family, num_envs, _observation_space(), _action_space(), max_episode_steps, reward_type)
-        self._positions = np.zeros((num_envs, 2), dtype=np.float32)
-
-    def _reset_state(self, indices: NDArray[np.int64]) -> FloatArray:
-        self._positions[indices] = 0.0
-        return self._positions[indices]
-
-    def _step_state(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        self._positions = _move(self._positions, actions)
-        return self._positions, np.zeros(self.num_envs, dtype=np.float32), np.zeros(self.num_envs, dtype=np.bool_)
+        super().__init__(PointRobotFamily(**family_kwargs), PointRobotDynamics(num_envs), max_episode_steps, reward_type)

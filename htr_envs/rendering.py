@@ -1,4 +1,4 @@
-"""Pictures of the environments that need no simulator's renderer: numpy draws them, with smooth edges."""
+"""A canvas for environments that need no simulator's renderer: numpy draws, with smooth edges."""
 
 from __future__ import annotations
 
@@ -153,48 +153,3 @@ class Canvas:
     def image(self) -> NDArray[np.uint8]:
         """The picture so far, shape (400, 400, 3)."""
         return self._image.round().astype(np.uint8)
-
-
-def draw_point_robot(path: FloatArray, goal: FloatArray, goal_distance: float, goal_radius: float) -> NDArray[np.uint8]:
-    """Draw one episode of the point robot: axes, the semicircle of possible goals, the goal, the start, the path, the robot.
-
-    The goal is filled strongly while the robot is in it.
-
-    :param path: positions from the start up to now, shape (n, 2).
-    :param goal: the episode's goal, shape (2,).
-    :param goal_distance: radius of the semicircle.
-    :param goal_radius: radius of the goal.
-    :return: picture (400, 400, 3), uint8.
-    """
-    # 20 steps lead at most 2 along each axis: a robot of that episode length never leaves the picture
-    half_width = max(2.2, 1.1 * goal_distance + goal_radius)
-    canvas = Canvas(half_width)
-    canvas.circle((0.0, 0.0), goal_distance, 3, PALE_ORANGE, upper_half=True)
-    canvas.axes()
-
-    reached = bool(np.hypot(*(path[-1] - goal)) < goal_radius)
-    canvas.disc(goal, goal_radius, ORANGE, 1.0 if reached else 0.5)
-    canvas.circle(goal, goal_radius, 2, ORANGE)
-
-    canvas.path(path)
-    canvas.legend([("GOAL", ORANGE), ("START", None), ("ROBOT", BLUE)])
-    return canvas.image()
-
-
-def draw_target_speed(path: FloatArray, speed: float, tolerance: float) -> NDArray[np.uint8]:
-    """Draw one episode of the sledge in the plane of its velocities: axes, the ring that solves the task, the path.
-
-    The ring is filled strongly while the speed is held.
-
-    :param path: velocities from the start up to now, shape (n, 2).
-    :param speed: the episode's target speed.
-    :param tolerance: half the width of the ring.
-    :return: picture (400, 400, 3), uint8.
-    """
-    canvas = Canvas(4.2)
-    held = bool(abs(np.hypot(*path[-1]) - speed) < tolerance)
-    canvas.circle((0.0, 0.0), speed, 2 * tolerance / canvas.pixel, ORANGE if held else PALE_ORANGE)
-    canvas.axes()
-    canvas.path(path)
-    canvas.legend([("TARGET SPEED", ORANGE), ("START", None), ("SLEDGE", BLUE)])
-    return canvas.image()

@@ -8,32 +8,15 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from htr_envs.rendering import draw_target_speed
-from htr_envs.task_env import BoolArray, FloatArray, TaskEnv, TaskFamily, Trajectory, at_step, check_reward_type
-from htr_envs.task_split import split_evenly
-from htr_envs.task_vector_env import TaskVectorEnv
+from htr_envs.dynamics import Dynamics, DynamicsEnv, DynamicsVectorEnv
+from htr_envs.rendering import BLUE, ORANGE, PALE_ORANGE, Canvas
+from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, at_step, check_reward_type, split_evenly
 
 FRICTION = np.float32(0.95)
 THRUST = np.float32(0.2)
 CONTROL_COST = np.float32(0.01)
 # What full thrust along one axis would reach in the end
 TOP_SPEED = 4.0
-RENDER_MODES = ("rgb_array",)
-
-
-def _push(velocities: FloatArray, actions: FloatArray) -> tuple[FloatArray, FloatArray]:
-    thrust = np.clip(actions, -1.0, 1.0)
-    # full thrust from the bound leads back to it but for rounding, and the observation's bounds must hold
-    pushed: FloatArray = np.clip(FRICTION * velocities + THRUST * thrust, -TOP_SPEED, TOP_SPEED)
-    return pushed, -CONTROL_COST * (thrust[..., 0] ** 2 + thrust[..., 1] ** 2)
-
-
-def _observation_space() -> spaces.Box:
-    return spaces.Box(-TOP_SPEED, TOP_SPEED, (2,), np.float32)
-
-
-def _action_space() -> spaces.Box:
-    return spaces.Box(-1.0, 1.0, (2,), np.float32)
 
 
 class TargetSpeedFamily(TaskFamily):
@@ -132,7 +115,46 @@ class TargetSpeedFamily(TaskFamily):
         return error
 
 
-class TargetSpeedEnv(TaskEnv):
+class TargetSpeedDynamics(Dynamics[TargetSpeedFamily]):
+    """The sledges of :class:`TargetSpeedEnv`; their states are their velocities.
+
+    :param num_envs: how many sledges.
+    """
+
+    def __init__(self, num_envs: int) -> None:
+        velocities, thrusts = spaces.Box(-TOP_SPEED, TOP_SPEED, (2,), np.float32), spaces.Box(-1.0, 1.0, (2,), np.float32)
+        super().__init__(num_envs, velocities, thrusts)
+        self.states = np.zeros((num_envs, 2), dtype=np.float32)
+
+    def reset(self, indices: NDArray[np.int64], rng: np.random.Generator) -> FloatArray:
+        self.states[indices] = 0.0
+        return self.states[indices]
+
+    def step(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        thrust = np.clip(actions, -1.0, 1.0)
+        # full thrust from the bound leads back to it but for rounding, and the observation's bounds must hold
+        self.states = np.clip(FRICTION * self.states + THRUST * thrust, -TOP_SPEED, TOP_SPEED)
+        cost = CONTROL_COST * (thrust[:, 0] ** 2 + thrust[:, 1] ** 2)
+        return self.states, -cost, np.zeros(self.num_envs, dtype=np.bool_)
+
+    def render(
+        self, task_family: TargetSpeedFamily, task: FloatArray, path: FloatArray, render_mode: str
+    ) -> NDArray[np.uint8]:
+        """Draw the plane of velocities, the ring that solves the task, filled strongly while the speed is held, and the path.
+
+        :return: picture (400, 400, 3), uint8.
+        """
+        (speed,), tolerance = task.tolist(), task_family.tolerance
+        canvas = Canvas(4.2)
+        held = bool(abs(np.hypot(*path[-1]) - speed) < tolerance)
+        canvas.circle((0.0, 0.0), speed, 2 * tolerance / canvas.pixel, ORANGE if held else PALE_ORANGE)
+        canvas.axes()
+        canvas.path(path)
+        canvas.legend([("TARGET SPEED", ORANGE), ("START", None), ("SLEDGE", BLUE)])
+        return canvas.image()
+
+
+class TargetSpeedEnv(DynamicsEnv):
     """
     ## Description
 
@@ -213,38 +235,13 @@ class TargetSpeedEnv(TaskEnv):
     - v0: first version
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # type: ignore[misc]
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}  # type: ignore[misc]
 
     def __init__(self, reward_type: str = "sparse", render_mode: str | None = None, **family_kwargs: Any) -> None:
-        if render_mode is not None and render_mode not in RENDER_MODES:
-            raise ValueError(f"render_mode is {render_mode!r}, but only 'rgb_array' exists: pass it or None.")
-        super().__init__(TargetSpeedFamily(**family_kwargs), reward_type)
-        self.observation_space = _observation_space()
-        self.action_space = _action_space()
-        self.render_mode = render_mode
-        self._path: list[FloatArray] = []
-
-    def _reset_state(self) -> FloatArray:
-        self._path = [np.zeros(2, dtype=np.float32)]
-        return self._path[0]
-
-    def _step_state(self, action: FloatArray) -> tuple[FloatArray, float, bool]:
-        velocity, cost = _push(self._path[-1], action)
-        self._path.append(velocity)
-        return velocity, float(cost), False
-
-    def render(self) -> NDArray[np.uint8] | None:
-        """Draw the plane of velocities, the target speed of the current episode and the velocities so far.
-
-        :return: picture (400, 400, 3), uint8; None without a render mode.
-        """
-        if self.render_mode is None:
-            return None
-        assert isinstance(self.task_family, TargetSpeedFamily)
-        return draw_target_speed(np.stack(self._path), float(self.task[0]), self.task_family.tolerance)
+        super().__init__(TargetSpeedFamily(**family_kwargs), TargetSpeedDynamics(1), reward_type, render_mode)
 
 
-class TargetSpeedVectorEnv(TaskVectorEnv):
+class TargetSpeedVectorEnv(DynamicsVectorEnv):
     """Many sledges that step together; see :class:`TargetSpeedEnv` for what they do.
 
     :param num_envs: how many sledges.
@@ -256,14 +253,4 @@ class TargetSpeedVectorEnv(TaskVectorEnv):
     def __init__(
         self, num_envs: int = 1, max_episode_steps: int | None = 40, reward_type: str = "sparse", **family_kwargs: Any
     ) -> None:
-        family = TargetSpeedFamily(**family_kwargs)
-        super().__init__(family, num_envs, _observation_space(), _action_space(), max_episode_steps, reward_type)
-        self._velocities = np.zeros((num_envs, 2), dtype=np.float32)
-
-    def _reset_state(self, indices: NDArray[np.int64]) -> FloatArray:
-        self._velocities[indices] = 0.0
-        return self._velocities[indices]
-
-    def _step_state(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        self._velocities, cost = _push(self._velocities, actions)
-        return self._velocities, cost, np.zeros(self.num_envs, dtype=np.bool_)
+        super().__init__(TargetSpeedFamily(**family_kwargs), TargetSpeedDynamics(num_envs), max_episode_steps, reward_type)

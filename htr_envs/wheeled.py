@@ -7,9 +7,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from htr_envs.locomotion_family import ARENA, LocomotionFamily
+from htr_envs.dynamics import DynamicsEnv, DynamicsVectorEnv
 from htr_envs.mujoco_dynamics import DoubleArray, MujocoDynamics, mujoco  # which says so where MuJoCo is missing
-from htr_envs.mujoco_env import RENDER_MODES, MujocoTaskEnv, MujocoTaskVectorEnv
+from htr_envs.semicircle_goals import LOCOMOTION_ARENA, LocomotionFamily
 from htr_envs.task_env import BoolArray, FloatArray
 
 MODEL = Path(__file__).parent / "assets" / "wheeled.xml"
@@ -19,8 +19,10 @@ TOP_TURN_RATE = 100.0  # rad/s
 
 
 class WheeledDynamics(MujocoDynamics):
-    """The robot of :class:`WheeledEnv`.
+    """The robots of :class:`WheeledEnv`.
 
+    :param num_envs: how many robots.
+    :param n_threads: how many threads step them, see :class:`htr_envs.mujoco_dynamics.MujocoDynamics`.
     :param ctrl_cost_weight: weight of the control cost.
     :param reset_noise_scale: noise of the starting state.
     """
@@ -29,9 +31,10 @@ class WheeledDynamics(MujocoDynamics):
     n_exact_positions = 3  # x, y, and z, with which the robot stands on the floor
     envs_per_thread = 32
 
-    def __init__(self, ctrl_cost_weight: float, reset_noise_scale: float) -> None:
-        bounds = [ARENA, ARENA, 1.0, 1.0, TOP_SPEED, TOP_SPEED, TOP_TURN_RATE, TOP_SPEED, TOP_SPEED]
-        super().__init__(mujoco.MjSpec.from_file(str(MODEL)), reset_noise_scale, np.array(bounds, dtype=np.float32))
+    def __init__(self, num_envs: int, n_threads: int | None, ctrl_cost_weight: float, reset_noise_scale: float) -> None:
+        bounds = [*[LOCOMOTION_ARENA] * 2, 1.0, 1.0, TOP_SPEED, TOP_SPEED, TOP_TURN_RATE, TOP_SPEED, TOP_SPEED]
+        spec = mujoco.MjSpec.from_file(str(MODEL))
+        super().__init__(num_envs, n_threads, spec, reset_noise_scale, np.array(bounds, dtype=np.float32))
         self.ctrl_cost_weight = np.float32(ctrl_cost_weight)
 
     def _start_position(self) -> DoubleArray:
@@ -55,7 +58,19 @@ class WheeledDynamics(MujocoDynamics):
         return -self.ctrl_cost_weight * np.square(actions).sum(axis=-1)
 
 
-class WheeledEnv(MujocoTaskEnv):
+def _wheeled(
+    num_envs: int,
+    n_threads: int | None,
+    /,
+    ctrl_cost_weight: float = 0.005,
+    reset_noise_scale: float = 0.01,
+    **family_kwargs: Any,
+) -> tuple[LocomotionFamily, WheeledDynamics]:
+    # the first two by position alone: a single env has no argument n_threads, and so refuses it
+    return LocomotionFamily(**family_kwargs), WheeledDynamics(num_envs, n_threads, ctrl_cost_weight, reset_noise_scale)
+
+
+class WheeledEnv(DynamicsEnv):
     """
     ## Description
 
@@ -168,21 +183,13 @@ class WheeledEnv(MujocoTaskEnv):
     - v0: first version
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 100}  # type: ignore[misc]
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 100}  # type: ignore[misc]
 
-    def __init__(
-        self,
-        reward_type: str = "sparse",
-        render_mode: str | None = None,
-        ctrl_cost_weight: float = 0.005,
-        reset_noise_scale: float = 0.01,
-        **family_kwargs: Any,
-    ) -> None:
-        dynamics = WheeledDynamics(ctrl_cost_weight, reset_noise_scale)
-        super().__init__(LocomotionFamily(**family_kwargs), dynamics, reward_type, render_mode)
+    def __init__(self, reward_type: str = "sparse", render_mode: str | None = None, **kwargs: Any) -> None:
+        super().__init__(*_wheeled(1, 1, **kwargs), reward_type, render_mode)
 
 
-class WheeledVectorEnv(MujocoTaskVectorEnv):
+class WheeledVectorEnv(DynamicsVectorEnv):
     """Many two-wheeled robots that step together, in native threads; see :class:`WheeledEnv` for what they do.
 
     :param num_envs: how many robots.
@@ -190,9 +197,7 @@ class WheeledVectorEnv(MujocoTaskVectorEnv):
     :param reward_type: reward of ``step``, ``"sparse"`` or ``"dense"``.
     :param n_threads: how many threads step the robots; the results do not depend on it. None for ``OMP_NUM_THREADS`` if that
         is set, else one for each CPU that this process may use, but for no more than have enough to do.
-    :param ctrl_cost_weight: weight of the control cost.
-    :param reset_noise_scale: noise of the starting state.
-    :param family_kwargs: arguments of :class:`htr_envs.LocomotionFamily`.
+    :param kwargs: the other arguments of :class:`WheeledEnv`, but for ``render_mode``.
     """
 
     def __init__(
@@ -201,10 +206,6 @@ class WheeledVectorEnv(MujocoTaskVectorEnv):
         max_episode_steps: int | None = 200,
         reward_type: str = "sparse",
         n_threads: int | None = None,
-        ctrl_cost_weight: float = 0.005,
-        reset_noise_scale: float = 0.01,
-        **family_kwargs: Any,
+        **kwargs: Any,
     ) -> None:
-        dynamics = WheeledDynamics(ctrl_cost_weight, reset_noise_scale)
-        family = LocomotionFamily(**family_kwargs)
-        super().__init__(family, dynamics, num_envs, max_episode_steps, reward_type, n_threads)
+        super().__init__(*_wheeled(num_envs, n_threads, **kwargs), max_episode_steps, reward_type)

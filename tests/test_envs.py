@@ -9,12 +9,14 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from broken_envs import LineFamily
+from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from gymnasium.utils.env_checker import data_equivalence
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-from htr_envs import TaskEnv, TaskVectorEnv, Trajectory, check_task_env
+from htr_envs import Dynamics, DynamicsEnv, DynamicsVectorEnv, TaskEnv, TaskVectorEnv, Trajectory, check_task_env
 
 ENV_IDS = [env_id for env_id, spec in gym.registry.items() if str(spec.entry_point).startswith("htr_envs.")]
 POINT_ROBOT = "SparsePointRobot-v0"
@@ -187,6 +189,61 @@ def test_vector_env_follows_gymnasiums_conventions(env_id: str) -> None:
     kept = observations.copy()
     vector.step(vector.action_space.sample())
     np.testing.assert_array_equal(observations, kept)
+
+
+# ---------------------------------------------------------------- dynamics of one's own
+
+
+class Walkers(Dynamics[LineFamily]):
+    """Walk on a line, pay for the effort, and end beyond 2."""
+
+    def __init__(self, num_envs: int) -> None:
+        super().__init__(num_envs, spaces.Box(-5.0, 5.0, (1,), np.float32), spaces.Box(-1.0, 1.0, (1,), np.float32))
+        self.states = np.zeros((num_envs, 1), dtype=np.float32)
+
+    def reset(self, indices: Any, rng: np.random.Generator) -> Any:
+        self.states[indices] = rng.uniform(-0.1, 0.1, (len(indices), 1))
+        return self.states[indices]
+
+    def step(self, actions: Any) -> Any:
+        effort = np.clip(actions, -1.0, 1.0)
+        self.states = np.clip(self.states + np.float32(0.2) * effort, -5.0, 5.0)
+        return self.states, np.float32(-0.01) * effort[:, 0] ** 2, self.states[:, 0] > 2.0
+
+
+def test_dynamics_written_once_are_a_single_and_a_batched_env() -> None:
+    single, vector = DynamicsEnv(LineFamily(), Walkers(1)), DynamicsVectorEnv(LineFamily(), Walkers(1))
+    check_task_env(gym.wrappers.TimeLimit(single, 30))
+    gymnasium_check_env(single, skip_render_check=True)
+    observation, _ = single.reset(seed=1)
+    np.testing.assert_array_equal(vector.reset(seed=1)[0], [observation])
+    n_episodes = 0
+    for action in np.random.default_rng(0).uniform(-0.5, 1.2, (200, 1)).astype(np.float32):
+        observation, reward, terminated, _, info = single.step(action)
+        observations, rewards, _, _, infos = vector.step(action[None])
+        assert (rewards[0], infos["task_id"][0]) == (reward, info["task_id"])
+        if terminated:
+            n_episodes += 1
+            observation, _ = single.reset()
+        np.testing.assert_array_equal(observations, [observation])
+    assert n_episodes >= 5
+    for env in (single, vector):
+        env.close()
+
+
+def test_dynamics_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(ValueError, match="num_envs is 0"):
+        Walkers(0)
+    with pytest.raises(ValueError, match="needs dynamics of one"):
+        DynamicsEnv(LineFamily(), Walkers(2))
+    with pytest.raises(ValueError, match="render_mode is 'rgb_array'"):
+        DynamicsEnv(LineFamily(), Walkers(1), render_mode="rgb_array")
+
+
+def test_threads_are_no_argument_of_a_single_env() -> None:
+    for env_id in NOISY_STARTS:
+        with pytest.raises(TypeError, match="n_threads"):
+            gym.make(env_id, n_threads=2)
 
 
 # ---------------------------------------------------------------- the rules on tasks

@@ -13,34 +13,39 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import data_equivalence
 
-from htr_envs import LocomotionFamily, Trajectory
+from htr_envs import DynamicsEnv, DynamicsVectorEnv, LocomotionFamily, Trajectory
 from sb3_htr.common.random_state import get_generator_state, set_generator_state
 from sb3_htr.common.vec_env import make_task_vec_env
 
 mujoco = pytest.importorskip("mujoco")
 
 from htr_envs.ant import AntEnv, AntVectorEnv  # noqa: E402
-from htr_envs.mujoco_dynamics import FULL_PHYSICS, available_threads  # noqa: E402
-from htr_envs.mujoco_env import MujocoTaskEnv, MujocoTaskVectorEnv  # noqa: E402
+from htr_envs.mujoco_dynamics import FULL_PHYSICS, MujocoDynamics, available_threads  # noqa: E402
 from htr_envs.wheeled import WHEEL_RADIUS, WheeledEnv, WheeledVectorEnv  # noqa: E402
 
 WHEELED, ANT = "SparseWheeled-v0", "SparseAnt-v0"
 both_envs = pytest.mark.parametrize("env_id", [WHEELED, ANT])
 
 
-def make(env_id: str, **kwargs: Any) -> tuple[gym.Env[Any, Any], MujocoTaskEnv]:
+def make(env_id: str, **kwargs: Any) -> tuple[gym.Env[Any, Any], DynamicsEnv]:
     env = gym.make(env_id, **kwargs)
-    assert isinstance(env.unwrapped, MujocoTaskEnv)
+    assert isinstance(env.unwrapped, DynamicsEnv)
     return env, env.unwrapped
 
 
-def make_vec(env_id: str, num_envs: int, **kwargs: Any) -> MujocoTaskVectorEnv:
+def make_vec(env_id: str, num_envs: int, **kwargs: Any) -> DynamicsVectorEnv:
     env = gym.make_vec(env_id, num_envs=num_envs, **kwargs)
-    assert isinstance(env, MujocoTaskVectorEnv)
+    assert isinstance(env, DynamicsVectorEnv)
     return env
 
 
-def random_actions(env: gym.Env[Any, Any] | MujocoTaskVectorEnv, n_steps: int, seed: int = 0) -> Any:
+def robots(env: gym.Env[Any, Any] | DynamicsVectorEnv) -> MujocoDynamics:
+    base = env.unwrapped
+    assert isinstance(base, DynamicsEnv | DynamicsVectorEnv) and isinstance(base.dynamics, MujocoDynamics)
+    return base.dynamics
+
+
+def random_actions(env: gym.Env[Any, Any] | DynamicsVectorEnv, n_steps: int, seed: int = 0) -> Any:
     shape = env.action_space.shape
     assert shape is not None
     # some are beyond the bounds, which clip them
@@ -88,7 +93,7 @@ def test_copies_put_into_the_states_of_single_envs_agree_with_them(env_id: str, 
     vector.reset()
     for i, (env, base) in enumerate(singles):
         env.reset(seed=i, options={"task": [0.01 * i, 0.0]})
-        vector._batch.states[i] = base._batch.states[0]
+        robots(vector).states[i] = robots(base).states[0]
         vector._tasks[i] = base.task
     for actions in random_actions(vector, 150):
         observations, rewards, terminated, _, infos = vector.step(actions)
@@ -114,16 +119,16 @@ def test_the_number_of_threads_changes_nothing(env_id: str) -> None:
 def test_steps_are_mujocos_own(env_id: str) -> None:
     _, base = make(env_id)
     base.reset(seed=0)
-    dynamics = base._batch.dynamics
+    dynamics = robots(base)
     model = dynamics.model
     data = mujoco.MjData(model)
-    mujoco.mj_setState(model, data, base._batch.states[0], FULL_PHYSICS)
+    mujoco.mj_setState(model, data, dynamics.states[0], FULL_PHYSICS)
     for action in random_actions(base, 100):
         data.ctrl[:] = np.clip(action, -1.0, 1.0)
         mujoco.mj_step(model, data, dynamics.frame_skip)
         info = base.step(action)[4]
-        np.testing.assert_array_equal(dynamics.positions(base._batch.states)[0], data.qpos)
-        np.testing.assert_array_equal(dynamics.velocities(base._batch.states)[0], data.qvel)
+        np.testing.assert_array_equal(dynamics.positions(dynamics.states)[0], data.qpos)
+        np.testing.assert_array_equal(dynamics.velocities(dynamics.states)[0], data.qvel)
         cost = 0.005 * np.square(np.clip(action, -1.0, 1.0)).sum()
         if env_id == ANT:
             cost += 5e-4 * np.square(np.clip(data.sensordata, -1.0, 1.0)).sum() - 0.05
@@ -170,8 +175,8 @@ def test_the_default_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     for value, expected in (("1", 1), ("3", 3), ("2,1", 2)):
         monkeypatch.setenv("OMP_NUM_THREADS", value)
         assert available_threads() == expected
-        assert make_vec(ANT, 64)._batch.n_threads == expected
-        assert make_vec(WHEELED, 16)._batch.n_threads == 1
+        assert robots(make_vec(ANT, 64)).n_threads == expected
+        assert robots(make_vec(WHEELED, 16)).n_threads == 1
     for value in ("many", "0", "-1"):
         monkeypatch.setenv("OMP_NUM_THREADS", value)
         with pytest.raises(ValueError, match="OMP_NUM_THREADS"):
@@ -237,8 +242,8 @@ def test_the_weights_are_arguments() -> None:
         env.reset(seed=0)
         assert env.step(action)[4]["task_free_reward"] == pytest.approx(-1.25 * weight)
 
-    def free_rewards(torque: float, *weights: float) -> Any:
-        ant = AntEnv("sparse", None, *weights)
+    def free_rewards(torque: float, ctrl_cost: float, contact_cost: float, healthy_reward: float) -> Any:
+        ant = AntEnv(ctrl_cost_weight=ctrl_cost, contact_cost_weight=contact_cost, healthy_reward=healthy_reward)
         ant.reset(seed=0)
         return np.array([ant.step(np.full(8, torque, np.float32))[4]["task_free_reward"] for _ in range(100)])
 
@@ -252,7 +257,7 @@ def test_the_weights_are_arguments() -> None:
 def test_an_unhealthy_ant_ends_its_episode_without_the_bonus() -> None:
     vector = AntVectorEnv(num_envs=4, contact_cost_weight=0.0)
     vector.reset(seed=0)
-    z = vector._batch.dynamics.positions(vector._batch.states)[:, 2]
+    z = robots(vector).positions(robots(vector).states)[:, 2]
     z[:] = [0.7, 1.3, 0.1, 0.75]
     # held there by the model's own speed: the step is short
     _, _, terminated, _, infos = vector.step(np.zeros((4, 8), np.float32))
@@ -270,7 +275,7 @@ def test_a_state_that_is_not_finite_ends_the_episode_with_finite_numbers(
     monkeypatch.chdir(tmp_path)  # MuJoCo leaves a log of its warnings
     vector = make_vec(env_id, 3)
     vector.reset(seed=0)
-    vector._batch.states[1, 3:] = value
+    robots(vector).states[1, 3:] = value
     observations, rewards, terminated, _, infos = vector.step(vector.action_space.sample())
     assert terminated.tolist() == [False, True, False]
     assert infos["final_obs"] in vector.observation_space and observations in vector.observation_space
@@ -297,7 +302,7 @@ def test_the_wheeled_robots_observation_is_that_of_the_docstring() -> None:
         turned = cos * before[:, 3] - sin * before[:, 2]
         np.testing.assert_allclose(turn_rate, -np.arcsin(turned) / 0.01, atol=1.5)
         before = after
-    assert WHEEL_RADIUS == vector._batch.dynamics.model.geom("left_wheel").size[0]
+    assert WHEEL_RADIUS == robots(vector).model.geom("left_wheel").size[0]
 
 
 def test_the_wheels_roll_where_the_motors_are_steady() -> None:
@@ -344,7 +349,7 @@ def test_a_simple_controller_drives_to_every_test_goal_and_stays_there() -> None
 
 
 def test_the_ant_is_gymnasiums_with_a_lower_gear() -> None:
-    ant, reference = AntEnv()._batch.dynamics.model, gym.make("Ant-v5").unwrapped.model  # type: ignore[attr-defined]
+    ant, reference = robots(AntEnv()).model, gym.make("Ant-v5").unwrapped.model  # type: ignore[attr-defined]
     np.testing.assert_array_equal(ant.actuator_gear[:, 0], 30.0)
     np.testing.assert_array_equal(ant.actuator_gear[:, 0] * 5.0, reference.actuator_gear[:, 0])
     bodies = [reference.body(i).name for i in range(reference.nbody)]
@@ -359,8 +364,8 @@ def test_the_feet_of_a_standing_ant_bear_its_weight() -> None:
     env.reset(seed=0)
     for _ in range(100):
         env.step(np.zeros(8, np.float32))
-    weight = 9.81 * env._batch.dynamics.model.body("torso").subtreemass[0]
-    assert env._batch._sensors[0, -1].sum() == pytest.approx(weight, rel=0.02)
+    weight = 9.81 * robots(env).model.body("torso").subtreemass[0]
+    assert robots(env)._sensors[0, -1].sum() == pytest.approx(weight, rel=0.02)
 
 
 @pytest.mark.parametrize(("env_id", "n_episodes", "radius"), [(WHEELED, 2000, 0.225), (ANT, 250, 0.81)])

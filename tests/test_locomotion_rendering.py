@@ -9,12 +9,12 @@ from gymnasium.utils.env_checker import data_equivalence
 
 pytest.importorskip("mujoco")
 
-from test_locomotion_envs import both_envs, make, random_actions
+from test_locomotion_envs import both_envs, make, random_actions, robots
 
-from htr_envs.mujoco_env import MujocoTaskEnv
+from htr_envs import DynamicsEnv
 
 
-def picture(env: MujocoTaskEnv) -> Any:
+def picture(env: DynamicsEnv) -> Any:
     try:
         frame = env.render()
     except Exception as error:
@@ -59,7 +59,7 @@ def test_rendering_changes_nothing(env_id: str) -> None:
         assert data_equivalence(seen.step(action), unseen.step(action), exact=True)
     assert (frames[0] != frames[-1]).any()
     # neither does the goal, which is a body of the model that nothing touches
-    model = base._batch.dynamics.model
+    model = robots(base).model
     assert model.geom("goal").contype[0] == model.geom("goal").conaffinity[0] == 0
     twin = pickle.loads(pickle.dumps(seen))
     assert data_equivalence(seen.step(action), twin.step(action), exact=True)
@@ -85,6 +85,6 @@ def test_a_window_shows_the_reset_and_each_step(env_id: str, monkeypatch: pytest
     env.reset(seed=0, options={"task": [0.5, 1.0]})
     env.step(env.action_space.sample())
     env.close()
-    step = base._batch.dynamics.control_step
+    step = robots(base).control_step
     assert shown == [("human", [0.5, 1.0], 0.0), ("human", [0.5, 1.0], pytest.approx(step)), "closed"]
     assert env.metadata["render_fps"] == pytest.approx(1.0 / step)
