@@ -45,7 +45,7 @@ wheel: $(STAMP) ## build the sdist and the wheel into dist/
 	$(BIN)/python -m build
 
 bench: $(STAMP) ## run every benchmark; each writes its figures to benchmarks/results/
-	@set -e; for script in $(BENCHMARKS); do echo "$$script"; $(BIN)/python "$$script"; done; $(BIN)/python benchmarks/_tables.py
+	@set -e; for script in $(BENCHMARKS); do echo "$$script"; $(BIN)/python "$$script"; done; $(BIN)/python tools/benchmark_tables.py
 
 clean: ## remove build outputs and caches (keeps .venv and runs)
 	rm -rf build dist *.egg-info docs/_build .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

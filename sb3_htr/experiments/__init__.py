@@ -1,1 +1,1 @@
-"""The figures under ``results/`` as code: each module is one experiment, ``python -m sb3_htr.experiments.NAME`` repeats it."""
+"""The figures under ``results/`` as code: ``sb3-htr experiment NAME`` repeats one of them."""

@@ -2,25 +2,17 @@
 
 import json
 import platform
-import sys
 from collections.abc import Callable
 from datetime import date
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.experiments.runner import LOGGED, Cell
-from sb3_htr.zoo.plots.curves import band, finish
+from sb3_htr.experiments.grid import Experiment
+from sb3_htr.experiments.runner import LOGGED, Cell, run_cells
 from sb3_htr.zoo.plots.intervals import iqm_difference, iqm_interval
-from sb3_htr.zoo.plots.adaptation import COLOURS
-
-RESULTS = Path(__file__).parents[2] / "results"
-
-# Draws the results of all cells into a file
-Plot = Callable[[dict[Cell, Path], Path], None]
 
 
 def loss_of_stability(curve: np.ndarray) -> float:
@@ -48,45 +40,49 @@ METRICS: dict[str, Callable[[Any, str], float]] = {
 }
 
 
-def summarize(name: str, results: dict[Cell, Path]) -> dict[str, Any]:
+def summarize(name: str, command: str, results: dict[Cell, Path]) -> dict[str, Any]:
     """
     :param name: of the experiment
+    :param command: that repeats it
     :param results: raw results of its cells
     :return: content of ``summary.json``
     """
-    groups: dict[tuple[str, str], dict[str, list[Cell]]] = {}
+    groups: dict[str, dict[str, list[Cell]]] = {}
     for cell in results:
-        groups.setdefault((cell.env_id, str(cell.env_kwargs)), {}).setdefault(cell.method, []).append(cell)
+        groups.setdefault(str(cell.env_kwargs), {}).setdefault(cell.variant, []).append(cell)
     rows, differences = [], []
-    for methods in groups.values():
+    for variants in groups.values():
         reference: np.ndarray | None = None
-        for method, cells in methods.items():
-            raw = [np.load(results[cell]) for cell in cells]
-            about = {"env": cells[0].env_id, "env_kwargs": cells[0].env_kwargs, "method": method}
-            for explorer in cells[0].explorers:
+        for variant, cells in variants.items():
+            first, raw = cells[0], [np.load(results[cell]) for cell in cells]
+            about: dict[str, Any] = {
+                "env": first.env_id,
+                "env_kwargs": first.env_kwargs,
+                "method": first.method,
+                "variant": variant,
+            }
+            about |= {"settings": first.settings, "env_steps": first.n_timesteps, "n_seeds": len(cells)}
+            means = {key: round(float(np.mean([r[key] for r in raw])), 4) for key in (*LOGGED, "wall_s")}
+            for explorer in first.explorers:
                 for metric, function in METRICS.items():
                     scores = np.array([function(r, explorer) for r in raw])
-                    settings = {"hyperparams": cells[0].hyperparams, "explorer": explorer, "metric": metric}
-                    budget = {"env_steps": cells[0].n_timesteps, "n_seeds": len(cells)}
-                    rows.append({**about, **settings, **budget, **_rounded(iqm_interval(scores))})
-            means = {key: round(float(np.mean([r[key] for r in raw])), 4) for key in (*LOGGED, "wall_s")}
-            for row in rows[-len(METRICS) * len(cells[0].explorers) :]:
-                row.update(means)
-            scores = np.array([METRICS["last_episode_return"](r, cells[0].explorers[0]) for r in raw])
+                    interval = _rounded(iqm_interval(scores))
+                    rows.append({**about, "explorer": explorer, "metric": metric, **interval, **means})
+            scores = np.array([METRICS["last_episode_return"](r, first.explorers[0]) for r in raw])
             if reference is None:
-                reference, first = scores, method
+                reference, compared = scores, variant
             else:
-                difference = _rounded(iqm_difference(reference, scores))
-                differences.append({**about, "of": first, "metric": "last_episode_return", **difference})
+                difference = {"of": compared, "metric": "last_episode_return", "explorer": first.explorers[0]}
+                differences.append({**about, **difference, **_rounded(iqm_difference(reference, scores))})
     commits = sorted({str(np.load(path)["commit"]) for path in results.values()})
     return {
         "name": name,
-        "command": " ".join(["python", "-m", f"sb3_htr.experiments.{name}", *sys.argv[1:]]),
+        "command": command,
         "commit": ", ".join(commits),
         "date": date.today().isoformat(),
         "machine": f"{_processor()}, one thread per run, Python {platform.python_version()}",
         "rows": rows,
-        # first method minus this one
+        # first variant minus this one
         "differences": differences,
     }
 
@@ -103,49 +99,33 @@ def _processor() -> str:
     return platform.processor() or platform.machine()
 
 
-def write(name: str, results: dict[Cell, Path], plot: Plot) -> Path:
+def write(name: str, command: str, experiment: Experiment, results: dict[Cell, Path], folder: Path) -> None:
     """
     Write ``summary.json``, ``raw.npz`` and the picture of an experiment.
 
     :param name: of the experiment
+    :param command: that repeats it
+    :param experiment: draws the picture
     :param results: raw results of its cells
-    :param plot: draws the picture
-    :return: folder with the three
+    :param folder: where they go
     """
-    folder = RESULTS / name
     folder.mkdir(parents=True, exist_ok=True)
     raw = {f"{cell.name}/{key}": value for cell, path in results.items() for key, value in np.load(path).items()}
     with atomic_path(folder / "raw.npz") as path:
         np.savez_compressed(path, **raw)
     with atomic_path(folder / "summary.json") as path:
-        path.write_text(json.dumps(summarize(name, results), indent=1) + "\n")
-    plot(results, folder / f"{name}.png")
-    return folder
+        path.write_text(json.dumps(summarize(name, command, results), indent=1) + "\n")
+    experiment.figure(results, folder / f"{name}.png")
 
 
-def plot_learning(results: dict[Cell, Path], path: Path) -> None:
+def run(name: str, experiment: Experiment, cells: list[Cell], runs: Path, output: Path, jobs: int) -> None:
     """
-    Left: learning curves on validation tasks. Right: the final models' adaptation to the test tasks.
-
-    :param results: raw results of the cells
-    :param path: picture to write
+    :param name: of the experiment
+    :param experiment: what is run
+    :param cells: its runs
+    :param runs: folder for them
+    :param output: folder for the results
+    :param jobs: runs at a time
     """
-    groups: dict[str, list[Any]] = {}
-    for cell, result in results.items():
-        groups.setdefault(cell.method, []).append((cell, np.load(result)))
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
-    for colour, (method, runs) in zip(COLOURS, groups.items(), strict=False):
-        curve = np.stack([raw["curve"].mean(axis=1) for _, raw in runs])
-        band(left, runs[0][1]["timesteps"] / 1000, curve, colour, "-", method)
-        for explorer, style in zip(runs[0][0].explorers, ("-", "--"), strict=False):
-            returns = np.stack([raw[f"returns_{explorer}"].mean(axis=0) for _, raw in runs])
-            band(right, np.arange(1, returns.shape[1] + 1), returns, colour, style, f"{method}, explorer {explorer}")
-    left.set_xlabel("thousand env steps of meta-training")
-    left.set_ylabel("return of the last adaptation episode")
-    left.set_title("validation tasks, during meta-training", fontsize=10)
-    right.set_xlabel("adaptation episode")
-    right.set_ylabel("return")
-    right.xaxis.get_major_locator().set_params(integer=True)
-    right.set_title("test tasks, final models", fontsize=10)
-    n_seeds = len(next(iter(groups.values())))
-    finish(figure, path, f"{next(iter(results)).env_id}: IQM over {n_seeds} seeds, 95 % interval")
+    n_seeds = len({cell.seed for cell in cells})
+    write(name, f"sb3-htr experiment {name} --seeds {n_seeds}", experiment, run_cells(cells, runs, jobs), output)

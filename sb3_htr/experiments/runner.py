@@ -6,15 +6,15 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import htr_envs  # noqa: F401 registers the envs
-from sb3_htr.common.atomic import atomic_path
 from sb3_htr.adaptation.evaluation import evaluate_adaptation
+from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.resume import checkpoints
 from sb3_htr.zoo.run.agents import agent_at, find_run
 
@@ -28,51 +28,54 @@ class Cell:
     One training run.
 
     :param env_id: registered env
-    :param method: name in ``summary.json``
+    :param method: name in hyperparams/methods.yml
+    :param variant: name in tables and folders
     :param seed: seed of the run
     :param n_timesteps: budget of env steps
-    :param hyperparams: what differs from the YAML file
+    :param eval_freq: env steps between evaluations on the validation tasks
+    :param settings: hyperparameters, joined with those of env and method
     :param env_kwargs: arguments of the env
     :param explorers: how the final model explores on the test tasks; one row of results for each
     """
 
     env_id: str
     method: str
+    variant: str
     seed: int
     n_timesteps: int
-    hyperparams: dict[str, Any] = field(default_factory=dict)
-    env_kwargs: dict[str, Any] = field(default_factory=dict)
-    explorers: tuple[str, ...] = ("search", "prior")
+    eval_freq: int
+    settings: dict[str, Any]
+    env_kwargs: dict[str, Any]
+    explorers: tuple[str, ...]
 
     @property
     def name(self) -> str:
         """Folder of the run."""
         kwargs = "".join(f"-{key}{value}" for key, value in self.env_kwargs.items())
-        return f"{self.method}{kwargs}-seed{self.seed}"
+        return f"{self.variant}{kwargs}-seed{self.seed}".replace(" ", "")
 
-    def command(self, folder: Path, eval_freq: int) -> list[str]:
+    def command(self, folder: Path) -> list[str]:
         """
         :param folder: log folder
-        :param eval_freq: env steps between evaluations on the validation tasks
         :return: command line of the training
         """
-        settings = [f"{key}:{value!r}" for key, value in self.hyperparams.items()]
+        settings = [f"{key}:{value!r}" for key, value in self.settings.items()]
         kwargs = [f"{key}:{value!r}" for key, value in self.env_kwargs.items()]
         return [
-            *(sys.executable, "-m", "sb3_htr.zoo.cli", "train", "--env", self.env_id, "-f", str(folder), "--verbose", "0"),
-            *("-n", str(self.n_timesteps), "--seed", str(self.seed), "--eval-freq", str(eval_freq)),
+            *(sys.executable, "-m", "sb3_htr.zoo.cli", "train", "--env", self.env_id, "--method", self.method),
+            *("-f", str(folder), "--verbose", "0", "-n", str(self.n_timesteps)),
+            *("--seed", str(self.seed), "--eval-freq", str(self.eval_freq)),
             *(["-params", *settings] if settings else []),
             *(["--env-kwargs", *kwargs] if kwargs else []),
         ]
 
 
-def run_cell(cell: Cell, folder: Path, eval_freq: int) -> Path:
+def run_cell(cell: Cell, folder: Path) -> Path:
     """
     Train, then adapt the final model to the test tasks.
 
     :param cell: what to run
     :param folder: where all cells' folders are; a cell that has a result there is not run again
-    :param eval_freq: env steps between evaluations
     :return: npz with ``timesteps``, ``curve`` (n, n_tasks) on validation tasks, and for each explorer
         ``returns_<explorer>`` and ``successes_<explorer>`` (n_tasks, n_episodes) on test tasks; the means of what is in
         ``LOGGED``; ``wall_s`` of the training and ``commit`` of the code
@@ -83,7 +86,7 @@ def run_cell(cell: Cell, folder: Path, eval_freq: int) -> Path:
     start = time.monotonic()
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     (folder / cell.name).mkdir(parents=True, exist_ok=True)
-    command = _resume(folder / cell.name) or cell.command(folder / cell.name, eval_freq)
+    command = _resume(folder / cell.name) or cell.command(folder / cell.name)
     with open(folder / cell.name / "log.txt", "a") as log:
         subprocess.run(command, check=True, stdout=log, stderr=log, env=environment)
     wall = time.monotonic() - start
@@ -123,14 +126,13 @@ def _commit() -> str:
         return ""
 
 
-def run_cells(cells: list[Cell], folder: Path, jobs: int, eval_freq: int = 10_000) -> dict[Cell, Path]:
+def run_cells(cells: list[Cell], folder: Path, jobs: int) -> dict[Cell, Path]:
     """
     :param cells: runs of the experiment
     :param folder: where runs and results go
     :param jobs: number of runs at a time, each on one thread
-    :param eval_freq: env steps between evaluations
     :return: the result file of each cell
     """
     with ThreadPoolExecutor(jobs) as pool:
-        paths = list(pool.map(lambda cell: run_cell(cell, folder, eval_freq), cells))
+        paths = list(pool.map(lambda cell: run_cell(cell, folder), cells))
     return dict(zip(cells, paths, strict=True))

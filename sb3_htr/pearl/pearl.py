@@ -180,9 +180,7 @@ class PEARL(OffPolicyMetaAlgorithm):
     def _update(self, batch_size: int) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """One update of all networks. Posterior means (M, latent_dim), and what to log."""
         assert self.replay_buffer is not None
-        data = self.replay_buffer.sample(
-            batch_size, meta_batch_size=self.meta_batch_size, context_size=self.context_size
-        )
+        data = self.replay_buffer.sample(batch_size, meta_batch_size=self.meta_batch_size, context_size=self.context_size)
         # Each task has the same weight in a mean over transitions
         weight = (1.0 / (self.meta_batch_size * data.lengths)).repeat_interleave(data.lengths, output_size=len(data.rewards))
         # One backward pass through the encoder: it learns from the critics' errors and the KL term

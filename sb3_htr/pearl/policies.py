@@ -2,7 +2,7 @@
 
 import math
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch as th
@@ -121,7 +121,7 @@ class PEARLPolicy(SACPolicy):
     @property
     def device(self) -> th.device:
         """Where the networks are. SB3 looks for it among all parameters, which takes longer than to act."""
-        return self.actor.mu.weight.device if hasattr(self, "actor") else super().device
+        return cast(nn.Linear, self.actor.mu).weight.device if hasattr(self, "actor") else super().device
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)

@@ -14,6 +14,7 @@ COMMANDS = {
     "record": "film an agent that adapts, as mp4 or gif",
     "plot": "learning curves, adaptation curves, paths and the latent space, of one or several runs",
     "optimize": "search for hyperparameters with Optuna, by the return after adaptation",
+    "experiment": "repeat one of the experiments of this project",
     "export": "a small file to share, with a model card; can upload both to the Hugging Face Hub",
 }
 USAGE = (
@@ -53,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     command, *rest = arguments
     try:
-        importlib.import_module(f"sb3_htr.zoo.{command}").main(rest)
+        importlib.import_module(f"sb3_htr.zoo.commands.{command}").main(rest)
     except ModuleNotFoundError as error:
         package = (error.name or "").split(".")[0]
         if package in rest:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from sb3_htr.pearl.exploration import Explorer
+from sb3_htr.adaptation.explorers import EXPLORERS
 from sb3_htr.zoo.run.agents import TrainedAgent, agent_at, agent_for, import_packages
 
 TASK_SETS = ("test", "validation", "train")
@@ -57,7 +57,7 @@ def add_agent_arguments(parser: argparse.ArgumentParser, several: bool = False) 
     group.add_argument("--env", metavar="ID", help="look for an agent of this env in the log folder, then in trained_agents/")
     group.add_argument("-f", "--folder", type=Path, default=Path("logs"), help="log folder (default: logs)")
     group.add_argument("--exp-id", type=int, default=0, metavar="N", help="number of the run, 0 (default) for the latest")
-    group.add_argument("--algo", metavar="METHOD", help="pearl, or a method in trained_agents/ such as htr-ser")
+    group.add_argument("--method", metavar="NAME", help="method that it was trained by, such as htr-ec")
     group.add_argument("--model", choices=["best", "last"], default="best", help="of a run: best on validation tasks, or last")
     group.add_argument("--load-best", dest="model", action="store_const", const="best", help="the same as --model best")
     group.add_argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules that register envs")
@@ -75,7 +75,7 @@ def add_adaptation_arguments(parser: argparse.ArgumentParser, n_episodes: int) -
     group = parser.add_argument_group("adaptation")
     group.add_argument("--tasks", choices=TASK_SETS, default="test", help="set of tasks to adapt to (default: test)")
     group.add_argument("--n-episodes", type=int, default=n_episodes, metavar="N", help=f"per task (default: {n_episodes})")
-    group.add_argument("--explorer", choices=[e.value for e in Explorer], help="by default the model's own")
+    group.add_argument("--explorer", choices=list(EXPLORERS), help="by default the model's own")
     group.add_argument("--stochastic", action="store_true", help="sample actions instead of taking their mean")
     group.add_argument("--seed", type=int, default=0, help="of env and z (default: 0)")
 
@@ -97,7 +97,7 @@ def chosen_agent(parser: argparse.ArgumentParser, args: argparse.Namespace, path
                 f"(-f FOLDER --env ID looks for agents of an env)."
             )
     elif args.env is not None:
-        agent = agent_for(args.env, args.folder, args.algo, args.exp_id, args.model)
+        agent = agent_for(args.env, args.folder, args.method, args.exp_id, args.model)
     else:
         parser.error("say which agent: a run folder or model file, or --env ID")
     import_packages(agent.record["gym_packages"])

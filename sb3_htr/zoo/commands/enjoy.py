@@ -4,13 +4,11 @@ import argparse
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_htr.common.checks import get_task_family
-from sb3_htr.zoo.run.agents import TrainedAgent
 from sb3_htr.zoo.commands.arguments import add_adaptation_arguments, add_agent_arguments, make_parser, parse
+from sb3_htr.zoo.run.agents import TrainedAgent
 from sb3_htr.zoo.show.play import Moment, Player, heading, line, summary
 
 if TYPE_CHECKING:
@@ -21,8 +19,8 @@ EXAMPLE = """  sb3-htr enjoy --env SparsePointRobot-v0              an agent tha
   sb3-htr enjoy runs/pearl/SparsePointRobot-v0_1 --task 3 7
   sb3-htr enjoy --env SparsePointRobot-v0 -f runs --no-render --explorer prior"""
 
-# Shows the env as it is at a moment; False to stop
-Show = Callable[[gym.Env, Moment], bool]
+# Shows a moment; False to stop
+Show = Callable[[Moment], bool]
 
 
 def add_task_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,22 +35,21 @@ def add_task_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--verbose", type=int, default=1, help="0 prints nothing, 1 (default) a line for each episode")
 
 
-def watch(agent: TrainedAgent, args: argparse.Namespace, render_mode: str | None, show: Show) -> list[Moment]:
+def watch(agent: TrainedAgent, args: argparse.Namespace, every: int, show: Show) -> list[Moment]:
     """
     Play the tasks that the arguments name, and print what happens.
 
     :param agent: who plays
     :param args: of :func:`add_task_arguments`
-    :param render_mode: of the env
+    :param every: takes every N-th frame of an episode, and the last one; 0 takes none
     :param show: called at every reset and step
     :return: last moment of each task
     :raises ValueError: for a task or a number of episodes that there is not
     """
     model = agent.load(args.device)
-    env = agent.make_env(render_mode)
-    # The wrapper knows how to normalize, but resets by itself: frames of an episode's end would be lost
-    vec_env = agent.normalized(DummyVecEnv([lambda: env]))
-    tasks: np.ndarray = getattr(get_task_family(vec_env), f"{args.tasks}_tasks")
+    env = agent.make_env("rgb_array" if every else None)
+    player = Player(model, env, args.explorer, not args.stochastic, args.seed, every)
+    tasks: np.ndarray = getattr(get_task_family(player.vec_env), f"{args.tasks}_tasks")
     if args.n_episodes < 1:
         raise ValueError(f"--n-episodes is {args.n_episodes}, expected at least 1.")
     if args.n_tasks < 1:
@@ -61,19 +58,17 @@ def watch(agent: TrainedAgent, args: argparse.Namespace, render_mode: str | None
     wrong = [number for number in numbers if not 1 <= number <= len(tasks)]
     if wrong:
         raise ValueError(f"There is no {args.tasks} task {wrong[0]}: --task takes numbers from 1 to {len(tasks)}.")
-    normalize = vec_env.normalize_obs if isinstance(vec_env, VecNormalize) else lambda obs: obs
     say = print if args.verbose > 0 else lambda text: None
-    say(f"{agent.path}: {agent.env_id}, explorer {args.explorer or model.explorer!r}")
+    say(f"{agent.path}: {agent.env_id}, explorer {args.explorer or model.explorer.name!r}")
     if not args.task and args.n_tasks > len(tasks):
         say(f"There are only {len(tasks)} {args.tasks} tasks, fewer than --n-tasks {args.n_tasks}: playing all of them.")
-    player = Player(model, env, normalize, args.explorer, not args.stochastic, args.seed)
     ends: list[Moment] = []
     n_steps, going_on = 0, True
     for number in numbers:
         say(heading(tasks, args.tasks, number))
         for moment in player.play(tasks, number, args.n_episodes):
             n_steps += moment.step > 0
-            going_on = show(env, moment) and (args.n_timesteps is None or n_steps < args.n_timesteps)
+            going_on = show(moment) and (args.n_timesteps is None or n_steps < args.n_timesteps)
             if moment.ended:
                 say(line(moment))
             if not going_on:
@@ -106,15 +101,13 @@ def main(argv: Sequence[str]) -> None:
     args, agent = parse(parser, argv)
     window, captioner = (None, None) if args.no_render else _open_window(agent, args.fps)
 
-    def show(env: gym.Env, moment: Moment) -> bool:
-        if window is None or captioner is None:
+    def show(moment: Moment) -> bool:
+        if window is None or captioner is None or moment.frame is None:
             return True
-        frame = env.render()
-        assert isinstance(frame, np.ndarray)
-        return window.show(captioner(frame, moment))
+        return window.show(captioner(moment.frame, moment))
 
     try:
-        watch(agent, args, None if window is None else "rgb_array", show)
+        watch(agent, args, 0 if window is None else 1, show)
     except KeyboardInterrupt:
         pass
     finally:

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
+from sb3_htr.adaptation.evaluation import AdaptationRecord, record_adaptation
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checks import get_task_family
-from sb3_htr.adaptation.evaluation import AdaptationRecord, record_adaptation
 from sb3_htr.zoo.commands.arguments import add_adaptation_arguments, add_agent_arguments, make_parser, parse
 from sb3_htr.zoo.plots.adaptation import plot_adaptation_curve, plot_adaptation_paths, start_position
 
@@ -45,7 +45,7 @@ def main(argv: Sequence[str]) -> None:
     env = agent.make_vec_env(20)
     family = get_task_family(env)
     tasks = getattr(family, f"{args.tasks}_tasks")
-    explorer = args.explorer or model.explorer
+    explorer = args.explorer or model.explorer.name
     record = record_adaptation(
         model, env, tasks, args.n_episodes, explorer=explorer, deterministic=not args.stochastic, seed=args.seed
     )

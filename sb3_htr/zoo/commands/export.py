@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from sb3_htr import PEARL
+from sb3_htr.adaptation.evaluation import record_adaptation
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checks import get_task_family
-from sb3_htr.adaptation.evaluation import record_adaptation
-from sb3_htr.zoo.run.agents import RECORD, TrainedAgent
 from sb3_htr.zoo.commands.arguments import add_agent_arguments, make_parser, parse
+from sb3_htr.zoo.run.agents import RECORD, TrainedAgent
 from sb3_htr.zoo.run.model_card import model_card, training_command
 
 EXAMPLE = """  sb3-htr export runs/pearl/SparsePointRobot-v0_1 -o my_agent
@@ -22,7 +22,7 @@ EXAMPLE = """  sb3-htr export runs/pearl/SparsePointRobot-v0_1 -o my_agent
 # What a loaded model needs beside the arguments of PEARL
 ALSO_KEPT = ("observation_space", "action_space", "policy_class", "n_envs", "num_timesteps", "_n_updates")
 # Of a run's record, what holds on other machines too
-KEPT_OF_RECORD = ("env_id", "env_kwargs", "gym_packages", "seed", "n_timesteps", "hyperparams", "versions")
+KEPT_OF_RECORD = ("env_id", "method", "env_kwargs", "gym_packages", "seed", "n_timesteps", "hyperparams", "versions")
 
 
 def export(agent: TrainedAgent, path: Path) -> dict[str, Any]:
@@ -46,7 +46,7 @@ def export(agent: TrainedAgent, path: Path) -> dict[str, Any]:
     kept = {*inspect.signature(PEARL.__init__).parameters, *ALSO_KEPT} - {"tensorboard_log"}
     record = {key: agent.record[key] for key in KEPT_OF_RECORD if key in agent.record}
     which = "best on the validation tasks" if agent.path.stem == "best_model" else "last"
-    record |= {"command": training_command(agent.record), "normalize": agent.normalize_statistics()}
+    record["command"] = training_command(agent.record)
     record |= {"model": agent.record.get("model", which), "num_timesteps": model.num_timesteps}
     with atomic_path(path) as temporary:
         full = temporary.with_suffix(".full.zip")
@@ -109,13 +109,13 @@ def main(argv: Sequence[str]) -> None:
     exported = TrainedAgent(file, record, None)
     model, env = exported.load(), exported.make_vec_env(20)
     tasks = get_task_family(env).test_tasks
-    explorers = dict.fromkeys([model.explorer, "prior"])
+    explorers = dict.fromkeys([model.explorer.name, "prior"])
     scores = {explorer: record_adaptation(model, env, tasks, args.n_episodes, explorer=explorer) for explorer in explorers}
     with atomic_path(output / "README.md") as temporary:
         temporary.write_text(model_card(record, scores, args.push_to_hub))
     print(f"{output / 'README.md'}: model card, with scores on the test tasks")
     if args.film:
-        from sb3_htr.zoo import record as recording
+        from sb3_htr.zoo.commands import record as recording
 
         recording.main([str(file), "-o", str(output / "replay.mp4"), "--verbose", "0"])
     if args.push_to_hub:

@@ -12,12 +12,12 @@ import sqlalchemy
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 
-from sb3_htr.zoo import train
+from sb3_htr.zoo.commands import train
 
 HELP = """sb3-htr optimize: rl_zoo3's `train -optimize` (its arguments follow) for PEARL, with Optuna.
 
 The objective is the mean return of the last adaptation episode on the validation tasks; the test tasks stay unseen.
-The search space is in sb3_htr/zoo/search_space.py; what it does not name stays as in the YAML file.
+The search space is in sb3_htr/zoo/run/search_space.py; what it does not name stays as in the YAML file.
 
 examples:
   sb3-htr optimize --env SparsePointRobot-v0 -n 40000 --n-trials 20

@@ -1,7 +1,6 @@
 """``sb3-htr plot``: pictures of one or several runs."""
 
 import argparse
-import inspect
 from collections.abc import Callable, Iterable, Sequence
 from functools import reduce
 from pathlib import Path
@@ -10,19 +9,17 @@ from typing import NamedTuple
 import numpy as np
 import torch as th
 
-from sb3_htr import PEARL
-from sb3_htr.common.checks import get_task_family
 from sb3_htr.adaptation.evaluation import AdaptationRecord, run_adaptation
-from sb3_htr.zoo.run.agents import TrainedAgent, find_runs
+from sb3_htr.common.checks import get_task_family
 from sb3_htr.zoo.commands.arguments import add_adaptation_arguments, add_agent_arguments, chosen_agent, make_parser
+from sb3_htr.zoo.plots.adaptation import plot_adaptation_curve, plot_adaptation_paths, start_position
 from sb3_htr.zoo.plots.curves import Curve, plot_curves
 from sb3_htr.zoo.plots.latent import plot_latent_space
-from sb3_htr.zoo.plots.adaptation import plot_adaptation_curve, plot_adaptation_paths, start_position
+from sb3_htr.zoo.run.agents import TrainedAgent, find_runs
 
 EXAMPLE = """  sb3-htr plot --env SparsePointRobot-v0                  an agent that comes with the package
   sb3-htr plot runs/htr runs/sparse -l HTR "no relabelling"    the runs in a folder are the seeds of its curve
   sb3-htr plot runs --only learning -o pictures"""
-DEFAULT_EXPLORER = inspect.signature(PEARL.__init__).parameters["explorer"].default
 PICTURES = ("learning", "adaptation", "paths", "latent")
 
 
@@ -65,13 +62,13 @@ def adapt(agent: TrainedAgent, args: argparse.Namespace) -> Adapted:
     env = agent.make_vec_env(len(tasks))
     env.seed(args.seed)
     env.set_options([{"task": task} for task in tasks])
-    adaptation = model.start_adaptation(len(tasks), None, args.explorer, th.Generator().manual_seed(args.seed))
+    adaptation = model.start_adaptation(len(tasks), args.explorer, th.Generator().manual_seed(args.seed))
     record = run_adaptation(model.policy, env, adaptation, args.n_episodes, deterministic=not args.stochastic)
-    known_z = model.policy.latent_prior.known_tasks().z
+    known_z = model.knowledge.known_tasks().z
     radius = getattr(family, "goal_radius", None)
-    explorer = args.explorer or model.explorer
+    explorer = adaptation.explorer.name
     start = start_position(agent.make_env()) if tasks.shape[1] == 2 else None
-    return Adapted(tasks, radius, start, explorer, record, *adaptation.posterior(), ~adaptation.exploring(), known_z)
+    return Adapted(tasks, radius, start, explorer, record, *adaptation.posterior(), ~adaptation.explorer.exploring(), known_z)
 
 
 def groups_of(parser: argparse.ArgumentParser, args: argparse.Namespace) -> dict[str, list[TrainedAgent]]:
@@ -164,8 +161,7 @@ def main(argv: Sequence[str]) -> None:
         learning = {label: curve for label, agents in groups.items() if (curve := learning_curve(label, agents)) is not None}
         labels = ("return of the last adaptation episode", "share of tasks solved (%)")
         if learning:
-            settings = [agent.record.get("hyperparams", {}) for agents in groups.values() for agent in agents]
-            names = [setting.get("explorer", DEFAULT_EXPLORER) for setting in settings]
+            names = [agent.record["hyperparams"]["explorer"]["name"] for agents in groups.values() for agent in agents]
             about = f"{env_id}, validation tasks, {about_explorers(names)}"
             plot_curves(learning, new("learning_curves.png"), about, "thousand env steps of meta-training", labels)
         else:

@@ -21,7 +21,7 @@ examples:
 
 defaults here: --algo pearl -conf hyperparams/pearl.yml (of this package) --num-threads 1 --save-freq 20000
 beside rl_zoo3's:
-  --method NAME  htr-ser (default), htr-ec, pearl-dense, pearl-sparse, or one of these with -prior behind it: PEARL's own protocol
+  --method NAME  htr-ser (default), htr-ec, pearl-dense, pearl-sparse; with -prior behind it under PEARL's own protocol
   --resume RUN   go on with a run from its latest checkpoint, exactly; takes no other arguments
 no effect here: --eval-episodes and --n-eval-envs (an evaluation adapts to each validation task once, in 20 episodes)
 """
@@ -47,7 +47,8 @@ def main(argv: Sequence[str]) -> None:
     run: Path | None = None
     if args.resume is not None:
         if rest or args.method:
-            raise ValueError(f"train --resume goes on with the run's own arguments: leave {' '.join(rest) or '--method'} away.")
+            given = " ".join(rest) or "--method"
+            raise ValueError(f"train --resume goes on with the run's own arguments: leave {given} away.")
         run = find_run(args.resume)
         record = json.loads((run / "run.json").read_text())
         arguments, args.method = [*record["arguments"], "--seed", str(record["seed"])], record["method"]

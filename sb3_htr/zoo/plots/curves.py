@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sb3_htr.zoo.plots.intervals import iqm_interval
-from sb3_htr.zoo.plots.adaptation import COLOURS, save, span_unit_if_flat
+from sb3_htr.zoo.plots.style import COLOURS, save, span_unit_if_flat
 
 # With more points than these, a curve has no markers
 MAX_MARKERS = 15

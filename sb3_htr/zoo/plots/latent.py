@@ -5,7 +5,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from sb3_htr.zoo.plots.adaptation import GREY, save
+from sb3_htr.zoo.plots.style import GREY, save
 
 
 def principal_axes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -11,28 +11,25 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 import torch as th
-from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.utils import get_device
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv
 
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr import PEARL
 from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.zoo.run.method import get_method, methods
 from sb3_htr.zoo.run.shipped import shipped
 
 # Record of a run: in its folder, and in an exported model file
 RECORD = "run.json"
-# Method of a run in a log folder, and the order in which the shipped agents are looked through
-METHODS = ("pearl", "htr-ser", "htr-ec", "pearl-dense", "pearl-sparse")
 
 
 @dataclass(frozen=True)
 class TrainedAgent:
     """
     :param path: model file
-    :param record: of its training: ``env_id``, ``env_kwargs``, ``gym_packages``, and in an exported file ``normalize``
+    :param record: of its training: ``env_id``, ``method``, ``env_kwargs``, ``gym_packages``
     :param folder: run folder, None for a model file of its own
     """
 
@@ -44,6 +41,11 @@ class TrainedAgent:
     def env_id(self) -> str:
         """Env that it was trained on."""
         return str(self.record["env_id"])
+
+    @property
+    def method(self) -> str:
+        """Name of the method that it was trained by."""
+        return str(self.record.get("method", "unknown"))
 
     @property
     def name(self) -> str:
@@ -72,7 +74,7 @@ class TrainedAgent:
     def make_env(self, render_mode: str | None = None) -> gym.Env:
         """
         :param render_mode: of the env
-        :return: one env, whose observations are not normalized
+        :return: one env
         :raises ValueError: if it has no such mode
         """
         # An env that cannot be drawn need not know the argument
@@ -89,39 +91,9 @@ class TrainedAgent:
     def make_vec_env(self, n_envs: int) -> VecEnv:
         """
         :param n_envs: number of envs
-        :return: the envs, in the VecNormalize of the training if that had one
+        :return: the envs
         """
-        return self.normalized(make_task_vec_env(self.env_id, n_envs, env_kwargs=self.record["env_kwargs"]))
-
-    def normalized(self, env: VecEnv) -> VecEnv:
-        """
-        :param env: envs
-        :return: them, in the VecNormalize of the training if that had one, which learns no more
-        """
-        statistics = self.record.get("normalize")
-        if statistics is not None:
-            normalize = VecNormalize(env, training=False, norm_reward=False, clip_obs=statistics["clip_obs"])
-            assert isinstance(normalize.obs_rms, RunningMeanStd)
-            normalize.obs_rms.mean, normalize.obs_rms.var = np.array(statistics["mean"]), np.array(statistics["var"])
-            normalize.epsilon = statistics["epsilon"]
-            return normalize
-        file = self.folder and self.folder / self.env_id / "vecnormalize.pkl"
-        if not file or not file.exists():
-            return env
-        normalize = VecNormalize.load(str(file), env)
-        normalize.training = False
-        return normalize
-
-    def normalize_statistics(self) -> dict[str, Any] | None:
-        """
-        :return: what :meth:`normalized` needs, as plain data; None if observations are not normalized
-        """
-        env = self.normalized(DummyVecEnv([self.make_env]))
-        if not isinstance(env, VecNormalize):
-            return None
-        rms = env.obs_rms
-        assert isinstance(rms, RunningMeanStd)
-        return {"mean": rms.mean.tolist(), "var": rms.var.tolist(), "clip_obs": env.clip_obs, "epsilon": env.epsilon}
+        return make_task_vec_env(self.env_id, n_envs, env_kwargs=self.record["env_kwargs"])
 
 
 def find_runs(folder: Path) -> list[Path]:
@@ -201,15 +173,15 @@ def agent_for(
     """
     :param env_id: env
     :param folder: log folder of ``sb3-htr train``, with the runs in ``<method>/<env_id>_<exp_id>``
-    :param method: ``"pearl"`` in a log folder, the name of a method for the agents that come with the package; any by default
+    :param method: name of a method; any by default, in the order of :func:`methods`
     :param exp_id: number of the run, 0 for the latest
     :param which: ``"best"`` or ``"last"`` model of a run
     :return: the agent, of the log folder if that has one, else the one that comes with the package
     :raises FileNotFoundError: if there is none
     """
-    methods = METHODS if method is None else (method,)
+    names = list(methods()) if method is None else [get_method(method).name]
     numbers: list[str] = []
-    for name in methods:
+    for name in names:
         runs = [path.parent for path in Path(folder, name).glob(f"{env_id}_*/{RECORD}") if _number(path.parent, env_id) > 0]
         runs = sorted(runs, key=lambda run: _number(run, env_id), reverse=True)
         numbers += [f"{_number(run, env_id)} ({name})" for run in reversed(runs)]
@@ -217,7 +189,7 @@ def agent_for(
             # A run that has no model yet is passed over, if it was not asked for
             if exp_id or (run / "best_model.zip").exists() or (run / f"{env_id}.zip").exists():
                 return agent_at(run, which)
-    for name in methods if not exp_id else ():
+    for name in names if not exp_id else ():
         file = shipped("trained_agents") / name / f"{env_id}.zip"
         if file.exists():
             return agent_at(file)

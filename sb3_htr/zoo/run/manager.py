@@ -58,6 +58,7 @@ class MetaExperimentManager(ExperimentManager):
     def __init__(self, *args: Any, method: str | None = None, resumed: Path | None = None, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._method_name = method
+        self._unique = kwargs.get("uuid_str", "")
         self.resumed = resumed
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -147,8 +148,7 @@ class MetaExperimentManager(ExperimentManager):
             importlib.import_module("tensorboard")  # missing, it should be said before anything is written
         if self.resumed is None:
             number = get_latest_run_id(self.log_path, self.env_name) + 1
-            unique = self.save_path.removeprefix(os.path.join(self.log_folder, self.algo)).partition("_")[2].partition("_")[1:]
-            self.save_path = os.path.join(self.log_path, f"{self.env_name}_{number}{''.join(unique)}")
+            self.save_path = os.path.join(self.log_path, f"{self.env_name}_{number}{self._unique}")
         else:
             self.save_path = str(self.resumed)
             folder, self._checkpoint = load_latest(self.resumed)

@@ -22,19 +22,6 @@ SHOWN = (1, 2, 3, 5, 10)
 LOCAL = {"-f": 1, "--log-folder": 1, "-tb": 1, "--tensorboard-log": 1, "-P": 0, "--progress": 0, "--verbose": 1, "--seed": 1}
 
 
-def method(hyperparams: dict[str, Any]) -> str:
-    """
-    :param hyperparams: of a run
-    :return: name of the method, as in ``results/``
-    """
-    buffer = hyperparams.get("replay_buffer_kwargs") or {}
-    if "EpisodeClustering" in str(hyperparams.get("replay_buffer_class")):
-        return "htr-ec"
-    if buffer.get("relabel_probability", 0.8) > 0:
-        return "htr-ser"
-    return "pearl-dense" if buffer.get("rl_reward_type") == "dense" else "pearl-sparse"
-
-
 def training_command(record: dict[str, Any]) -> str:
     """
     :param record: of a run
@@ -46,6 +33,7 @@ def training_command(record: dict[str, Any]) -> str:
     # What `sb3-htr train` puts in front: --algo, -conf, --num-threads, --save-freq
     if arguments[:2] == ["--algo", "pearl"] and arguments[2:3] == ["-conf"]:
         arguments = arguments[8:]
+    arguments += ["--method", record["method"]]
     words: list[str] = []
     while arguments:
         word = arguments.pop(0)
@@ -80,7 +68,7 @@ def model_card(record: dict[str, Any], scores: dict[str, AdaptationRecord], repo
     :param repo_id: where it will be on the Hugging Face Hub
     :return: content of ``README.md``
     """
-    env_id, name = record["env_id"], method(record.get("hyperparams", {}))
+    env_id, name = record["env_id"], record["method"]
     explorer, adapted = next(iter(scores.items()))
     n_tasks, n_episodes = adapted.returns.shape
     returns = adapted.returns[:, -1]

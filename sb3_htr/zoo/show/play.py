@@ -1,14 +1,17 @@
 """An adaptation to one task, step by step, for those who watch it."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch as th
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_htr import PEARL
+from sb3_htr.adaptation.loop import adaptation_steps
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,7 @@ class Moment:
     :param exploring: whether the explorer chose z in this episode
     :param deviation: standard deviation of what is known about z, mean over its dimensions
     :param ended: whether the episode ends here
+    :param frame: (height, width, 3) uint8, None where none was taken
     """
 
     task: int
@@ -36,11 +40,51 @@ class Moment:
     exploring: bool
     deviation: float
     ended: bool
+    frame: np.ndarray | None
 
     @property
     def episode(self) -> int:
         """Number of the episode, from 1 on."""
         return len(self.returns)
+
+
+class Camera(gym.Wrapper):
+    """
+    Takes a frame at each reset and step: a VecEnv resets within the step that ends an episode, and its last frame is lost.
+
+    :param env: single env
+    :param every: takes every N-th frame of an episode, and the last one; 0 takes none
+    """
+
+    def __init__(self, env: gym.Env, every: int) -> None:
+        super().__init__(env)
+        self.every = every
+        # Since they were taken away: those of a step that ends an episode, and of the reset that follows, are two
+        self.frames: list[Any] = []
+        self._n_steps = 0
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        result = super().reset(**kwargs)
+        self._n_steps = 0
+        self._take(False)
+        return result
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        result = super().step(action)
+        self._n_steps += 1
+        self._take(result[2] or result[3])
+        return result
+
+    def _take(self, ended: bool) -> None:
+        taken = self.every > 0 and (ended or self._n_steps % self.every == 0)
+        self.frames.append(self.env.render() if taken else None)
+
+    def next_frame(self) -> np.ndarray | None:
+        """
+        :return: the oldest frame that was not taken away yet
+        """
+        frame: np.ndarray | None = self.frames.pop(0)
+        return frame
 
 
 class Player:
@@ -49,26 +93,26 @@ class Player:
 
     :param model: a PEARL
     :param env: single env of its task family
-    :param normalize: what the model sees of an observation
-    :param explorer: how z is drawn before the posterior is used, the model's own by default
+    :param explorer: name of the explorer, the model's own by default
     :param deterministic: mean actions instead of samples
     :param seed: of env and z
+    :param every: takes every N-th frame of an episode, and the last one; 0 takes none
     """
 
     def __init__(
         self,
         model: PEARL,
         env: gym.Env,
-        normalize: Callable[[Any], Any],
         explorer: str | None = None,
         deterministic: bool = True,
         seed: int = 0,
+        every: int = 0,
     ) -> None:
-        self.model, self.env, self.normalize = model, env, normalize
-        self.explorer, self.deterministic = explorer, deterministic
+        self.model, self.explorer, self.deterministic = model, explorer, deterministic
+        self.camera = Camera(env, every)
+        self.vec_env = DummyVecEnv([lambda: self.camera])
+        self.vec_env.seed(seed)
         self.generator = th.Generator().manual_seed(seed)
-        # For the first reset only
-        self.seed: int | None = seed
 
     def play(self, tasks: np.ndarray, number: int, n_episodes: int) -> Iterator[Moment]:
         """
@@ -77,37 +121,38 @@ class Player:
         :param tasks: set of tasks (n, task_dim)
         :param number: which of them, from 1 on
         :param n_episodes: adaptation episodes
-        :return: each reset and step; the env can be rendered in between
+        :return: each reset and step
         """
-        policy = self.model.policy
-        adaptation = self.model.start_adaptation(1, None, self.explorer, self.generator)
-        returns, successes = [], []
-        for _ in range(n_episodes):
-            obs, _ = self.env.reset(seed=self.seed, options={"task": tasks[number - 1]})
-            obs, self.seed = self.normalize(obs), None
+        policy, env = self.model.policy, self.vec_env
+        adaptation = self.model.start_adaptation(1, self.explorer, self.generator)
+        returns: list[float] = []
+        successes: list[bool] = []
+
+        def moment(step: int, exploring: bool, ended: bool) -> Moment:
+            deviation = float(adaptation.explorer.deviation().mean())
+            scores = tuple(returns), tuple(successes)
+            frame = self.camera.next_frame()
+            return Moment(number, len(tasks), n_episodes, step, *scores, exploring, deviation, ended, frame)
+
+        def begin() -> Moment:
             returns.append(0.0)
             successes.append(False)
-            exploring, step, ended = bool(adaptation.exploring()[0]), 0, False
-            deviation = float(adaptation.deviation().mean())
-            while True:
-                scores = tuple(returns), tuple(successes)
-                yield Moment(number, len(tasks), n_episodes, step, *scores, exploring, deviation, ended)
-                if ended:
-                    break
-                action, _ = policy.predict(obs, (adaptation.z,), deterministic=self.deterministic)
-                new_obs, reward, terminated, truncated, info = self.env.step(action)
-                step, ended = step + 1, terminated or truncated
-                returns[-1] += float(reward)
-                successes[-1] |= info["is_success"]
-                adaptation.observe(
-                    obs[None],
-                    policy.scale_action(action)[None],
-                    np.array([reward]),
-                    np.array([info["task_free_reward"]]),
-                    np.array([ended]),
-                )
-                deviation = float(adaptation.deviation().mean())
-                obs = self.normalize(new_obs)
+            return moment(0, exploring, False)
+
+        env.set_options({"task": tasks[number - 1]})
+        self.camera.frames.clear()
+        obs, n_steps, exploring = env.reset(), 0, bool(adaptation.explorer.exploring()[0])
+        yield begin()
+        act = partial(adaptation.act, deterministic=self.deterministic)
+        for step in adaptation_steps(env, adaptation, n_episodes, policy.unscale_action, act, obs):
+            n_steps, ended = n_steps + 1, bool(step.dones[0])
+            returns[-1] += float(step.rewards[0])
+            successes[-1] |= step.infos[0]["is_success"]
+            yield moment(n_steps, exploring, ended)
+            if ended:
+                n_steps, exploring = 0, bool(adaptation.explorer.exploring()[0])
+                if len(returns) < n_episodes:
+                    yield begin()
 
 
 def line(moment: Moment) -> str:

@@ -1,4 +1,4 @@
-"""Writes the result tables of the documents from ``results/*/summary.json``: ``python -m sb3_htr.experiments.tables``."""
+"""Writes the result tables of the documents from ``results/*/summary.json``: ``python tools/tables.py``."""
 
 import json
 from collections.abc import Iterable
@@ -6,16 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.experiments.report import RESULTS
 
+RESULTS = Path(__file__).parents[1] / "results"
 DOCUMENTS = (RESULTS.parent / "README.md", RESULTS.parent / "docs" / "results.md", RESULTS.parent / "docs" / "performance.md")
 # Experiments and methods in the table of README.md
 ENVS = ("point_robot", "wheeled", "ant")
-METHODS = {
-    "htr-ser": "HTR, sparse rewards",
-    "pearl-dense": "PEARL, dense proxy reward",
-    "pearl-sparse": "PEARL, sparse rewards",
-}
+METHODS = ("htr-ser", "pearl-dense", "pearl-sparse", "pearl-sparse-prior")
 COLUMNS = {
     "last_episode_return": "return of the 20th episode",
     "success_rate": "tasks solved in it",
@@ -31,7 +27,7 @@ def table(summary: dict[str, Any]) -> str:
     lines: dict[tuple[str, ...], dict[str, str]] = {}
     settings = sorted({key for row in summary["rows"] for key in row["env_kwargs"]})
     for row in summary["rows"]:
-        key = (*(str(row["env_kwargs"][setting]) for setting in settings), row["method"], row["explorer"])
+        key = (*(str(row["env_kwargs"][setting]) for setting in settings), row["variant"], row["explorer"])
         lines.setdefault(key, {})[row["metric"]] = f"{row['iqm']:.2f} [{row['low']:.2f}, {row['high']:.2f}]"
     first = summary["rows"][0]
     head = [*(setting.replace("_", " ") for setting in settings), "method", "explorer", *COLUMNS.values()]
@@ -48,23 +44,24 @@ def table(summary: dict[str, Any]) -> str:
 def headline(summaries: dict[str, dict[str, Any]]) -> str:
     """
     :param summaries: contents of ``summary.json`` by their names, those of ``ENVS`` among them where they are there
-    :return: Markdown table, one line per env, with each method under the explorer that its runs name first
+    :return: Markdown table, one line per env, method and explorer
     """
-    lines = [["env", "env steps", "seeds", *METHODS.values()], ["---"] * (3 + len(METHODS))]
+    lines = [["env", "env steps", "seeds", "method", "explorer", *COLUMNS.values()]]
+    lines.append(["---"] * len(lines[0]))
     for summary in (summaries[name] for name in ENVS if name in summaries):
-        cells = []
-        for method in METHODS:
-            rows = [row for row in summary["rows"] if row["method"] == method]
-            score = {row["metric"]: row for row in rows if row["explorer"] == rows[0]["explorer"]}
-            cells.append(
-                "{iqm:.1f} [{low:.1f}, {high:.1f}], ".format(**score["last_episode_return"])
-                + f"{score['success_rate']['iqm']:.0%} solved"
-                if rows
-                else ""
-            )
-        first = summary["rows"][0]
-        lines.append([first["env"], f"{first['env_steps']:,}", str(first["n_seeds"]), *cells])
+        scores: dict[tuple[str, ...], dict[str, str]] = {}
+        for row in summary["rows"]:
+            if row["variant"] in METHODS:
+                key = (row["env"], f"{row['env_steps']:,}", str(row["n_seeds"]), row["variant"], f"`{row['explorer']}`")
+                scores.setdefault(key, {})[row["metric"]] = _interval(row)
+        lines += [[*key, *(cells[metric] for metric in COLUMNS)] for key, cells in scores.items()]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
+def _interval(row: dict[str, Any]) -> str:
+    if row["metric"] == "success_rate":
+        return f"{row['iqm']:.0%} [{row['low']:.0%}, {row['high']:.0%}]"
+    return f"{row['iqm']:.1f} [{row['low']:.1f}, {row['high']:.1f}]"
 
 
 def fill(documents: Iterable[Path], tables: dict[str, str]) -> None:

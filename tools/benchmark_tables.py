@@ -4,11 +4,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-from _common import RESULTS
-
-from sb3_htr.experiments.tables import fill
+from tables import fill
 
 ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
 
 
 def table(content: dict[str, Any]) -> str:

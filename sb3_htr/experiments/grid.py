@@ -1,0 +1,150 @@
+"""Every experiment: which methods, on which env, for how long, with how many seeds."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from sb3_htr.experiments import figures
+from sb3_htr.experiments.runner import Cell
+
+
+@dataclass(frozen=True, eq=False)
+class Variant:
+    """
+    One line of a table: a method, and what differs from its settings.
+
+    :param method: name in hyperparams/methods.yml
+    :param name: in tables and folders, that of the method by default
+    :param settings: hyperparameters, joined with those of env and method
+    :param env_kwargs: arguments of the env
+    :param budget: times the env steps of the experiment
+    """
+
+    method: str
+    name: str = ""
+    settings: dict[str, Any] = field(default_factory=dict)
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    budget: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """
+    :param about: one sentence
+    :param env_id: registered env
+    :param n_timesteps: env steps of a run
+    :param variants: what is compared; the first is what the others are compared with
+    :param seeds: runs of each variant
+    :param eval_freq: env steps between evaluations on the validation tasks
+    :param explorers: how the final models explore on the test tasks
+    :param figure: draws the results of all cells into a file
+    """
+
+    about: str
+    env_id: str
+    n_timesteps: int
+    variants: tuple[Variant, ...]
+    seeds: int = 5
+    eval_freq: int = 10_000
+    explorers: tuple[str, ...] = ("search", "prior")
+    figure: Callable[[dict[Cell, Path], Path], None] = figures.learning
+
+    def cells(self, seeds: int | None = None, scale: float = 1.0) -> list[Cell]:
+        """
+        :param seeds: runs of each variant, as many as the experiment asks for by default
+        :param scale: times its env steps
+        :return: the runs, seed by seed
+        """
+        return [
+            Cell(
+                env_id=self.env_id,
+                method=variant.method,
+                variant=variant.name or variant.method,
+                seed=seed,
+                n_timesteps=int(self.n_timesteps * variant.budget * scale),
+                eval_freq=max(int(self.eval_freq * scale), 1),
+                settings=variant.settings,
+                env_kwargs=variant.env_kwargs,
+                explorers=self.explorers,
+            )
+            for seed in range(1, (seeds or self.seeds) + 1)
+            for variant in self.variants
+        ]
+
+
+POINT, SPEED, WHEELED, ANT = "SparsePointRobot-v0", "SparseTargetSpeed-v0", "SparseWheeled-v0", "SparseAnt-v0"
+
+
+def replay(**settings: Any) -> dict[str, Any]:
+    """
+    :param settings: of the replay buffer
+    :return: hyperparameters
+    """
+    return {"replay_buffer_kwargs": settings}
+
+
+EXPERIMENTS: dict[str, Experiment] = {
+    "point_robot": Experiment(
+        "HTR by both kinds of relabelling, against PEARL as published and with a dense proxy reward.",
+        POINT,
+        150_000,
+        tuple(map(Variant, ("htr-ser", "htr-ec", "pearl-dense", "pearl-sparse", "pearl-sparse-prior"))),
+    ),
+    "wheeled": Experiment(
+        "HTR on a robot with wheels, against PEARL with a dense proxy reward and with the sparse one.",
+        WHEELED,
+        600_000,
+        tuple(map(Variant, ("htr-ser", "pearl-dense", "pearl-sparse"))),
+        eval_freq=50_000,
+    ),
+    "ant": Experiment(
+        "HTR on a robot with legs, against PEARL with a dense proxy reward and with the sparse one.",
+        ANT,
+        600_000,
+        tuple(map(Variant, ("htr-ser", "pearl-dense", "pearl-sparse"))),
+        eval_freq=100_000,
+    ),
+    "target_speed": Experiment(
+        "Tasks that are no places: both kinds of relabelling against PEARL with sparse and with dense rewards.",
+        SPEED,
+        60_000,
+        tuple(map(Variant, ("htr-ser", "htr-ec", "pearl-dense", "pearl-sparse"))),
+    ),
+    # HTR paper, figure 11. Steps of an episode for each distance: time to get there, and as long again. The budget is that of
+    # episodes of 20 steps; longer ones have as many episodes and updates
+    "goal_distance": Experiment(
+        "Goals ever further away.",
+        POINT,
+        60_000,
+        tuple(
+            Variant(method, env_kwargs={"goal_distance": distance, "max_episode_steps": n_steps}, budget=n_steps / 20)
+            for distance, n_steps in ((0.5, 20), (0.75, 20), (1.0, 20), (1.5, 30), (2.0, 40))
+            for method in ("htr-ser", "pearl-dense", "pearl-sparse")
+        ),
+        explorers=("search",),
+        figure=figures.goal_distance,
+    ),
+    # The first one is what the others are compared with; then the paper's sweep of K, and no relabelling
+    "relabelling": Experiment(
+        "How often to relabel, which hindsight task to choose, and the ablation of HTR paper, B.2.",
+        POINT,
+        40_000,
+        (
+            Variant("htr-ser", "K = 0.8"),
+            *(Variant("htr-ser", f"K = {k:g}", replay(relabel_probability=k)) for k in (0.0, 0.1, 0.3, 0.5, 1.0)),
+            Variant("htr-ser", "random state", replay(relabeller={"hindsight_task_strategy": "random"})),
+            Variant("htr-ser", "final state", replay(relabeller={"hindsight_task_strategy": "final"})),
+            Variant("htr-ser", "RL batch of the task", replay(relabeller={"rl_batch_source": "task"})),
+        ),
+        explorers=("search",),
+        figure=figures.relabelling,
+    ),
+    "precision": Experiment(
+        "What matrix products of bfloat16 factors cost.",
+        POINT,
+        150_000,
+        (Variant("htr-ser", "float32"), Variant("htr-ser", "bfloat16", {"matmul_precision": "medium"})),
+        explorers=("search",),
+    ),
+}
