@@ -1,0 +1,116 @@
+"""SER: relabelling when experience is drawn."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from helpers.experience import FAMILY, by_task, filled, make_buffer
+from htr_envs import Trajectory
+from sb3_htr.common.type_aliases import Context
+from sb3_htr.htr import HindsightTaskStrategy
+
+
+def relabelling(**settings: Any) -> dict[str, Any]:
+    """Arguments of a buffer that relabels whatever is drawn."""
+    return {"relabel_probability": 1.0, "relabeller": {"name": "SingleEpisodeRelabelling", **settings}}
+
+
+def trajectory(context: Context) -> Trajectory:
+    obs, action = context.observations.numpy(), context.actions.numpy()
+    return Trajectory(obs, action, (obs + 0.1 * action).astype(np.float32), np.zeros(len(obs), dtype=np.float32))
+
+
+@given(st.integers(0, 2**20), st.sampled_from([(20,), (1, 7, 20)]), st.floats(0, 1), st.sampled_from(HindsightTaskStrategy))
+def test_every_reward_is_that_of_one_task_per_row(
+    seed: int, lengths: tuple[int, ...], k: float, strategy: HindsightTaskStrategy
+) -> None:
+    """Rows that are not relabelled keep the env's reward; relabelled ones carry the reward of one task that was reached."""
+    settings = {**relabelling(hindsight_task_strategy=strategy), "relabel_probability": k}
+    data = filled(seed, lengths=lengths, seed=seed, **settings).sample(8, meta_batch_size=16, context_size=20)
+    traj = trajectory(data.context)
+    columns = [by_task(values, data.context.lengths) for values in (*traj, data.context.rewards)]
+    for row, (obs, action, next_obs, free, reward) in enumerate(zip(*columns, strict=True)):
+        steps = Trajectory(obs, action, next_obs, free)
+        if not data.relabelled[row]:
+            own = FAMILY.train_tasks[data.task_ids[row]]
+            np.testing.assert_array_equal(reward, FAMILY.compute_reward(steps, own), err_msg="own task")
+        else:
+            # The whole episode, so the step that reached the hindsight task too
+            assert (reward > 0).any()
+            # The task that a state solves is the place itself
+            candidates = FAMILY.compute_reward(Trajectory(*(x[None] for x in steps)), next_obs)
+            assert (candidates == reward).all(axis=1).any(), "no reached state gives these rewards"
+
+
+def test_context_and_rl_batch_come_from_one_episode() -> None:
+    data = filled(n_episodes=12, **relabelling()).sample(16, meta_batch_size=32, context_size=20)
+    context, batch = (
+        by_task(np.column_stack([drawn.observations, drawn.actions, drawn.rewards]), drawn.lengths)
+        for drawn in (data.context, data)
+    )
+    for episode, steps in zip(context, batch, strict=True):
+        assert len(episode) == 20 and len(steps) == 16
+        assert {tuple(step) for step in steps} <= {tuple(step) for step in episode}
+
+
+def test_a_batch_larger_than_an_episode_is_the_whole_episode_once() -> None:
+    data = filled(**relabelling()).sample(256, meta_batch_size=8, context_size=1024)
+    assert (data.lengths == 20).all() and (data.context.lengths == 20).all()
+
+
+def test_ablation_draws_the_rl_batch_from_the_whole_task() -> None:
+    buffers = [filled(n_episodes=24, **relabelling(rl_batch_source=source)) for source in ("episode", "task")]
+    zero = [(buffer.sample(16, meta_batch_size=200).rewards == 0).float().mean() for buffer in buffers]
+    # B.2: the whole buffer under one episode's task is mostly unrewarded
+    assert zero[1] > zero[0] + 0.1
+
+
+def places_of_hindsight_tasks(context: Context) -> np.ndarray:
+    """(n, 2): at the goal itself the reward is 1 - 0."""
+    return trajectory(context).next_observations[context.rewards.numpy() == 1]
+
+
+def test_final_strategy_takes_the_last_state() -> None:
+    buffer = filled(**relabelling(hindsight_task_strategy="final"))
+    index, columns = buffer.episodes.index(), buffer.transitions
+    ends = buffer.episodes.rows[index.rows[index.episode_row[1:] - 1], columns.next_observation]
+    reached = places_of_hindsight_tasks(buffer.sample(4, meta_batch_size=16, context_size=20).context)
+    assert len(reached) >= 16 and {tuple(place) for place in reached} <= {tuple(row) for row in ends}
+
+
+def hindsight_places(strategy: str) -> np.ndarray:
+    """(n, 2) hindsight tasks that are drawn from random walks, most of whose states are near the start."""
+    buffer = filled(n_episodes=60, **relabelling(hindsight_task_strategy=strategy))
+    draws = [buffer.sample(1, meta_batch_size=64, context_size=20) for _ in range(20)]
+    return np.concatenate([places_of_hindsight_tasks(data.context) for data in draws])
+
+
+def test_even_strategy_draws_tasks_that_are_rarely_reached_more_often() -> None:
+    random, even = (np.linalg.norm(hindsight_places(strategy), axis=1) for strategy in ("random", "even"))
+    assert len(random) == len(even) == 20 * 64
+    far = np.quantile(random, 0.9)
+    assert (even > far).mean() > 0.25, "a tenth of all states is that far from the start"
+
+
+@given(st.lists(st.lists(st.floats(0.1, 100), min_size=3, max_size=3), min_size=1, max_size=5), st.integers(0, 99))
+def test_candidates_are_chosen_inversely_to_how_common_they_are(counts: list[list[float]], seed: int) -> None:
+    count = np.repeat(np.array(counts), 4000, axis=0)
+    chosen = HindsightTaskStrategy.choose(count, np.random.default_rng(seed)).reshape(len(counts), 4000)
+    expected = (1 / np.array(counts)) / (1 / np.array(counts)).sum(axis=1, keepdims=True)
+    frequency = np.stack([np.bincount(row, minlength=3) for row in chosen]) / 4000
+    np.testing.assert_allclose(frequency, expected, atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"hindsight_task_strategy": "best"}, r"hindsight_task_strategy is 'best', expected one of \['even', 'final', 'ran"),
+        ({"rl_batch_source": "x"}, "rl_batch_source is 'x'"),
+    ],
+)
+def test_bad_settings(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_buffer(**relabelling(**settings))
