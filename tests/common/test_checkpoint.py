@@ -1,0 +1,102 @@
+"""Files that are never half written, damage that is noticed, and reading that runs no code."""
+
+import json
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch as th
+
+from helpers.bombs import Bomb
+from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.checkpoint import MANIFEST, STATE, DamagedCheckpoint, read_checkpoint, write_checkpoint
+from sb3_htr.common.resume import checkpoints, load_latest
+
+
+def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
+    file = tmp_path / "new" / "file.txt"
+    with atomic_path(file) as path:
+        path.write_text("old")
+    with pytest.raises(KeyboardInterrupt), atomic_path(file) as path:
+        path.write_text("half")
+        raise KeyboardInterrupt
+    assert file.read_text() == "old"
+    assert list(file.parent.iterdir()) == [file]
+    with atomic_path(tmp_path / "new") as folder:
+        folder.mkdir()
+        (folder / "other").write_text("x")
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["other"]
+
+
+def test_a_file_does_not_replace_a_folder(tmp_path: Path) -> None:
+    (tmp_path / "model.zip").mkdir()
+    (tmp_path / "model.zip" / "precious").touch()
+    with pytest.raises(OSError), atomic_path(tmp_path / "model.zip") as temporary:
+        temporary.touch()
+    assert [path.name for path in tmp_path.rglob("*")] == ["model.zip", "precious"]
+
+
+def truncate(folder: Path) -> None:
+    data = (folder / STATE).read_bytes()
+    (folder / STATE).write_bytes(data[: len(data) // 2])
+
+
+def flip_a_bit(folder: Path) -> None:
+    data = bytearray((folder / STATE).read_bytes())
+    data[len(data) // 3] ^= 1
+    (folder / STATE).write_bytes(bytes(data))
+
+
+def empty(folder: Path) -> None:
+    (folder / STATE).write_bytes(b"")
+
+
+def remove_state(folder: Path) -> None:
+    (folder / STATE).unlink()
+
+
+def remove_manifest(folder: Path) -> None:
+    (folder / MANIFEST).unlink()
+
+
+def garble_manifest(folder: Path) -> None:
+    (folder / MANIFEST).write_text("{")
+
+
+def foreign_format(folder: Path) -> None:
+    manifest = json.loads((folder / MANIFEST).read_text())
+    (folder / MANIFEST).write_text(json.dumps({**manifest, "format": 999}))
+
+
+DAMAGES = [truncate, flip_a_bit, empty, remove_state, remove_manifest, garble_manifest, foreign_format]
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_checkpoint_gives_one_sentence_and_the_next_older_one_is_taken(
+    damage: Callable[[Path], None], tmp_path: Path
+) -> None:
+    for steps in (240, 1200, 960):
+        write_checkpoint(tmp_path / "checkpoints" / f"{steps}_steps", {"steps": steps, "weights": th.ones(3)})
+    newest, older, oldest = checkpoints(tmp_path)
+    assert load_latest(tmp_path)[1]["steps"] == 1200
+    damage(newest)
+    with pytest.raises(DamagedCheckpoint) as error:
+        read_checkpoint(newest)
+    assert str(newest) in str(error.value) and len(str(error.value).split(". ")) == 1
+    with pytest.warns(UserWarning, match="next older checkpoint"):
+        folder, state = load_latest(tmp_path)
+    assert folder == older and state["steps"] == 960
+    damage(older)
+    damage(oldest)
+    with warnings.catch_warnings(), pytest.raises(FileNotFoundError, match="no checkpoint to go on from"):
+        warnings.simplefilter("ignore")
+        load_latest(tmp_path)
+
+
+def test_reading_a_checkpoint_runs_no_code(tmp_path: Path) -> None:
+    fuse = tmp_path / "exploded"
+    write_checkpoint(tmp_path / "1_steps", {"bomb": Bomb(fuse)})
+    with pytest.raises(Exception, match=r"(?i)weights.only"):
+        read_checkpoint(tmp_path / "1_steps")
+    assert not fuse.exists()

@@ -1,0 +1,58 @@
+"""Objects by name, by name and settings, or as they are."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import pytest
+
+from sb3_htr.adaptation import Aggregate, Explorer, Prior, Search
+from sb3_htr.adaptation.explorers import EXPLORERS, to_explorer
+from sb3_htr.common.settings import make
+from sb3_htr.htr import EpisodeClustering, Relabeller, SingleEpisodeRelabelling
+from sb3_htr.htr.relabel import RELABELLERS
+
+Kinds = Mapping[str, Callable[..., Any]]
+
+
+def test_a_name_a_name_with_settings_and_an_object_are_the_same() -> None:
+    own = Search(scale=2.0)
+    assert to_explorer(own) is own
+    assert to_explorer("search") == Search() and to_explorer({"name": "search", "scale": 2}) == own
+    assert to_explorer({"name": "prior", "n_exploration_episodes": 9}) == Prior(9)
+    assert type(to_explorer("aggregate")) is Aggregate
+
+
+@pytest.mark.parametrize(
+    ("what", "kinds", "base"), [("explorer", EXPLORERS, Explorer), ("relabeller", RELABELLERS, Relabeller)]
+)
+@pytest.mark.parametrize(
+    "value", ["nobody", {}, {"name": "nobody"}, {"name": None}, {"scale": 1}, None, 3, [], Search, {3: 4}]
+)
+def test_anything_else_is_answered_with_what_there_is(what: str, kinds: Kinds, base: Any, value: Any) -> None:
+    with pytest.raises(ValueError, match=rf"{what} is .*, expected one of .*object derived from {base.__name__}") as error:
+        make(what, value, kinds, base)
+    assert all(name in str(error.value) for name in kinds) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("kinds", "base", "settings", "message"),
+    [
+        (EXPLORERS, Explorer, {"name": "search", "max_setback": 2}, "'max_setback': did you mean max_setbacks"),
+        (EXPLORERS, Explorer, {"name": "prior", "scale": 2}, "'prior' has no setting 'scale': expected one of"),
+        (EXPLORERS, Explorer, {"name": "search", "scale": -1}, "scale is -1, expected a number of at least 0"),
+        (EXPLORERS, Explorer, {"name": "search", "clearly_better": 0.9}, "clearly_better is 0.9, expected a number of at"),
+        (EXPLORERS, Explorer, {"name": "aggregate", "max_setbacks": 1.5}, "max_setbacks is 1.5, expected a whole number"),
+        (EXPLORERS, Explorer, {"name": "prior", "n_exploration_episodes": -1}, "n_exploration_episodes is -1"),
+        (RELABELLERS, Relabeller, {"name": "EpisodeClustering", "cellsize": 1}, "'cellsize': did you mean cell_size"),
+        (RELABELLERS, Relabeller, {"name": "EpisodeClustering", "self": 1}, "no setting 'self'"),
+    ],
+)
+def test_a_setting_that_cannot_be_is_named(kinds: Kinds, base: Any, settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make("it", settings, kinds, base)
+
+
+def test_the_names_of_files_and_records_are_those_of_the_classes() -> None:
+    assert {name: explorer().name for name, explorer in EXPLORERS.items()} == {name: name for name in EXPLORERS}
+    assert {name: kind.__name__ for name, kind in RELABELLERS.items()} == {name: name for name in RELABELLERS}
+    assert set(RELABELLERS.values()) == {SingleEpisodeRelabelling, EpisodeClustering}

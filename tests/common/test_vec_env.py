@@ -1,0 +1,24 @@
+"""Batched envs as SB3 wants them."""
+
+import gymnasium as gym
+import pytest
+
+from helpers import ENV_ID
+from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
+
+
+def test_an_id_can_name_the_module_that_registers_it() -> None:
+    assert make_task_vec_env(f"htr_envs:{ENV_ID}").num_envs == 1
+
+
+def test_options_of_a_batch_must_agree() -> None:
+    env = make_task_vec_env(ENV_ID, 2)
+    env.set_options([{"task_id": 1}, {}])
+    with pytest.raises(ValueError, match="options with the same keys"):
+        env.reset()
+
+
+def test_only_same_step_autoreset_can_be_an_sb3_vec_env() -> None:
+    env = gym.make_vec(ENV_ID, 2, vectorization_mode="sync")
+    with pytest.raises(ValueError, match=r"expected AutoresetMode\.SAME_STEP"):
+        BatchedTaskVecEnv(env)
