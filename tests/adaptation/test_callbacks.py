@@ -1,22 +1,16 @@
-"""Evaluation during training, and files that are never half written."""
+"""Evaluation during training."""
 
-import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from conftest import ENV_ID
 
+from helpers import ENV_ID, ROLLOUT, MakePEARL
 from htr_envs import PointRobotFamily
 from sb3_htr import PEARL, evaluate_adaptation
-from sb3_htr.common.atomic import atomic_path
-from sb3_htr.adaptation.callbacks import MetaEvalCallback, MetaTrialEvalCallback
+from sb3_htr.adaptation import MetaEvalCallback
 from sb3_htr.common.vec_env import make_task_vec_env
-
-MakePEARL = Callable[..., PEARL]
-ROLLOUT = 4 * 3 * 20
 
 
 def test_meta_eval_logs_keeps_the_best_and_writes_npz(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
@@ -42,49 +36,6 @@ def test_meta_eval_is_on_validation_tasks_unless_told(tmp_path: Path) -> None:
     assert (MetaEvalCallback(env, tasks="test").tasks == family.test_tasks).all()
     with pytest.raises(ValueError, match="tasks is 'tset'"):
         MetaEvalCallback(env, tasks="tset")
-
-
-def test_a_trial_can_be_pruned(tiny_pearl: MakePEARL) -> None:
-    class Trial:
-        def __init__(self) -> None:
-            self.reported: list[tuple[float, int]] = []
-
-        def report(self, value: float, step: int) -> None:
-            self.reported.append((value, step))
-
-        def should_prune(self) -> bool:
-            return len(self.reported) == 2
-
-    trial = Trial()
-    callback = MetaTrialEvalCallback(make_task_vec_env(ENV_ID, 20), trial, eval_freq=20, n_adaptation_episodes=2)
-    model = tiny_pearl().learn(10 * ROLLOUT, callback=callback)
-    assert callback.is_pruned and model.num_timesteps == 2 * 20 * 4
-    assert [step for _, step in trial.reported] == [1, 2]
-
-
-def test_a_save_that_fails_leaves_the_old_model(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
-    model = tiny_pearl()
-    model.save(tmp_path / "model")
-    before = (tmp_path / "model.zip").read_bytes()
-    model.not_picklable = threading.Lock()  # type: ignore[attr-defined]
-    with pytest.raises(TypeError):
-        model.save(tmp_path / "model")
-    assert (tmp_path / "model.zip").read_bytes() == before and len(list(tmp_path.iterdir())) == 1
-
-
-def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
-    file = tmp_path / "new" / "file.txt"
-    with atomic_path(file) as path:
-        path.write_text("old")
-    with pytest.raises(KeyboardInterrupt), atomic_path(file) as path:
-        path.write_text("half")
-        raise KeyboardInterrupt
-    assert file.read_text() == "old"
-    assert list(file.parent.iterdir()) == [file]
-    with atomic_path(tmp_path / "new") as folder:
-        folder.mkdir()
-        (folder / "other").write_text("x")
-    assert [path.name for path in (tmp_path / "new").iterdir()] == ["other"]
 
 
 def test_a_full_disk_stops_no_evaluation(tiny_pearl: MakePEARL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
