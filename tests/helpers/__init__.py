@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import torch as th
 from hypothesis import settings
 
 from sb3_htr import PEARL
@@ -25,6 +26,12 @@ TINY: dict[str, Any] = {
 ROLLOUT = 4 * 3 * 20
 # PEARL's own protocol, with a posterior within the three episodes
 PRIOR = {"name": "prior", "n_exploration_episodes": 1}
+
+
+def parameters(model: PEARL) -> dict[str, th.Tensor]:
+    """Copies of all that a model has learnt."""
+    state = {**model.policy.state_dict(), **model.knowledge.state_dict(prefix="knowledge.")}
+    return {name: value.clone() for name, value in state.items()}
 
 
 def with_policy(**settings: Any) -> dict[str, Any]:

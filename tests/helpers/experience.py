@@ -8,6 +8,7 @@ import numpy as np
 from helpers import ENV_ID
 from htr_envs import PointRobotFamily, Trajectory
 from sb3_htr import MultiTaskReplayBuffer
+from sb3_htr.common.type_aliases import MultiTaskSamples
 
 FAMILY = PointRobotFamily()
 
@@ -52,3 +53,9 @@ def filled(walk_seed: int = 0, n_episodes: int = 6, lengths: tuple[int, ...] = (
 def by_task(values: Any, lengths: Any) -> list[np.ndarray]:
     """The rows of a sample, one array for each row of the meta-batch."""
     return np.split(np.asarray(values), np.cumsum(np.asarray(lengths))[:-1])
+
+
+def assert_same(a: MultiTaskSamples, b: MultiTaskSamples) -> None:
+    """Bit for bit."""
+    for name, x, y in zip((*a.context._fields, *a._fields[1:]), (*a.context, *a[1:]), (*b.context, *b[1:]), strict=True):
+        assert (np.asarray(x) == np.asarray(y)).all(), name

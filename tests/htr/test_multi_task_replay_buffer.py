@@ -10,19 +10,13 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
-from helpers.experience import FAMILY, add_episode, by_task, filled, make_buffer
+from helpers.experience import FAMILY, add_episode, assert_same, by_task, filled, make_buffer
 from htr_envs import PointRobotFamily
-from sb3_htr.common.type_aliases import MultiTaskSamples
 from sb3_htr.htr.multi_task_replay_buffer import spread
 from sb3_htr.htr.transitions import Transitions
 
 RELABELLERS = ["SingleEpisodeRelabelling", "EpisodeClustering"]
 both_relabellers = pytest.mark.parametrize("relabeller", RELABELLERS)
-
-
-def assert_same(a: MultiTaskSamples, b: MultiTaskSamples) -> None:
-    for name, x, y in zip(("context", *a._fields), (*a.context, *a[1:]), (*b.context, *b[1:]), strict=False):
-        assert (np.asarray(x) == np.asarray(y)).all(), name
 
 
 # --- spread: how rows are drawn

@@ -1,19 +1,12 @@
 """A training that goes wrong says so."""
 
 import warnings
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import torch as th
-from conftest import ENV_ID, TINY
 
-from sb3_htr import PEARL
+from helpers import ROLLOUT, MakePEARL
 from sb3_htr.pearl.divergence import DivergedError, PosteriorWatch
-from sb3_htr.zoo.cli import main
-
-MakePEARL = Callable[..., PEARL]
-ROLLOUT = 4 * 3 * 20
 
 
 def test_a_diverging_loss_stops_training_with_step_and_tensor(tiny_pearl: MakePEARL) -> None:
@@ -51,10 +44,3 @@ def test_a_collapsed_posterior_is_warned_of_in_training(tiny_pearl: MakePEARL) -
     model = tiny_pearl(kl_coef=1000.0, learning_rate=0.01, gradient_steps=300)
     with pytest.warns(UserWarning, match="collapsed"):
         model.learn(3 * ROLLOUT)
-
-
-def test_the_command_line_names_the_last_checkpoint(tmp_path: Path) -> None:
-    settings = [f"{key}:{value!r}" for key, value in TINY.items() if key != "seed"]
-    arguments = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-n", "960", "--eval-freq", "-1", "--save-freq", "1"]
-    with pytest.raises(DivergedError, match=r"at env step \d+.*The last checkpoint: .*checkpoints/\d+_steps\."):
-        main([*arguments, "--verbose", "0", "-params", "n_envs:4", *settings, "learning_rate:1e20", "learning_starts:480"])

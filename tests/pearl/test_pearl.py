@@ -1,7 +1,7 @@
 """PEARL behaves as an SB3 algorithm: learn, callbacks, several envs, schedules, determinism, save and load."""
 
+import inspect
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,24 +9,18 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from conftest import ENV_ID, TINY
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.utils import LinearSchedule
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import SubprocVecEnv
 
+from helpers import ENV_ID, PRIOR, ROLLOUT, TINY, MakePEARL, parameters, with_policy
+from helpers.experience import assert_same
 from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.common.vec_env import make_task_vec_env
-from sb3_htr.adaptation.explorers.task_belief import KnownTasks
-
-MakePEARL = Callable[..., PEARL]
-ROLLOUT = 4 * 3 * 20  # env steps of one rollout of the tiny settings
-
-
-def parameters(model: PEARL) -> dict[str, th.Tensor]:
-    return {name: value.clone() for name, value in model.policy.state_dict().items()}
+from sb3_htr.htr import EpisodeClustering
 
 
 class Counter(BaseCallback):
@@ -51,9 +45,12 @@ class Counter(BaseCallback):
         {},
         {"ent_coef": "auto"},
         {"learning_rate": lambda remaining: 1e-3 * remaining},
-        {"target_update_interval": 2, "explorer": "prior", "train_explorer": "prior"},
+        {"target_update_interval": 2, "explorer": PRIOR, "train_explorer": PRIOR},
+        {"train_explorer": "search"},
+        {"policy_kwargs": with_policy(normalize_observations=True)},
         {"replay_buffer_kwargs": {"relabel_probability": 0.0, "rl_reward_type": "dense"}},
-        {"replay_buffer_kwargs": {"relabel_probability": 1.0, "hindsight_task_strategy": "final"}},
+        {"replay_buffer_kwargs": {"relabeller": {"name": "SingleEpisodeRelabelling", "hindsight_task_strategy": "final"}}},
+        {"replay_buffer_kwargs": {"relabel_probability": 1.0, "relabeller": EpisodeClustering()}},
     ],
 )
 def test_learn_changes_every_network(tiny_pearl: MakePEARL, kwargs: dict[str, Any]) -> None:
@@ -63,29 +60,22 @@ def test_learn_changes_every_network(tiny_pearl: MakePEARL, kwargs: dict[str, An
     assert model.num_timesteps == 2 * ROLLOUT
     assert model._n_updates == 2 * 3
     after = parameters(model)
-    for network in ("actor.", "critic.", "critic_target.", "encoder.", "latent_prior."):
+    for network in ("actor.", "critic.", "critic_target.", "encoder.", "knowledge."):
         assert any(not th.equal(before[name], after[name]) for name in before if name.startswith(network)), network
 
 
-def test_critic_gradients_do_not_leak_into_the_encoder_from_the_actor(tiny_pearl: MakePEARL) -> None:
-    """The actor sees z detached: with the critics' and KL losses switched off, the encoder must not move."""
-    model = tiny_pearl(kl_coef=0.0)
-    model.learn(ROLLOUT)
-    model.critic.optimizer.param_groups[0]["lr"] = 0
-    model.lr_schedule = lambda _: 0.0
+def test_the_actor_does_not_shape_z(tiny_pearl: MakePEARL) -> None:
+    """It sees z detached: where the critics do not ask for z and the KL term is off, the encoder has no gradient."""
+    model = tiny_pearl(kl_coef=0.0).learn(2 * ROLLOUT)
+    obs_dim, latent_dim = 2, model.policy.latent_dim
+    with th.no_grad():
+        for network in (*model.critic.networks, *model.critic_target.networks):
+            network[0].weight[:, obs_dim : obs_dim + latent_dim] = 0  # type: ignore[index]
     before = parameters(model)
-    for group in model.actor.optimizer.param_groups:
-        group["lr"] = 1e-2
-    model._update_learning_rate = lambda optimizers: None  # type: ignore[method-assign]
-    model.encoder.optimizer.param_groups[0]["lr"] = 1e-2
-    data = model.replay_buffer.sample(4)  # type: ignore[union-attr]
-    z = model.encoder(data.context, data.context_lengths)[0].detach()
-    assert not z.requires_grad
-    model.train(1)
-    after = parameters(model)
-    assert all(th.equal(before[n], after[n]) for n in before if n.startswith("critic."))
-    assert any(not th.equal(before[n], after[n]) for n in before if n.startswith("actor."))
-    assert all(p.grad is not None and p.requires_grad for p in model.critic.parameters())
+    model._update(4)
+    assert all(p.grad is not None and not p.grad.any() for p in model.encoder.parameters())
+    assert all(p.grad is not None and p.grad.any() for p in (*model.actor.parameters(), *model.critic.parameters()))
+    assert any(not th.equal(before[name], value) for name, value in parameters(model).items() if name.startswith("actor."))
 
 
 def test_the_precision_of_matrix_products_is_that_of_updates_only(tiny_pearl: MakePEARL, monkeypatch: Any) -> None:
@@ -125,12 +115,30 @@ def test_any_number_of_envs(tiny_pearl: MakePEARL, n_envs: int) -> None:
 
 
 def test_envs_in_processes(tiny_pearl: MakePEARL) -> None:
-    assert make_task_vec_env(f"htr_envs:{ENV_ID}").num_envs == 1
     env = make_vec_env(f"htr_envs:{ENV_ID}", 2, vec_env_cls=SubprocVecEnv)
     try:
         tiny_pearl(env).learn(1)
     finally:
         env.close()
+
+
+def test_every_training_task_has_its_turn(tiny_pearl: MakePEARL) -> None:
+    """Every training task once, then every task once in another order, whatever the number of envs."""
+    for n_envs in (2, 3):
+        env = make_task_vec_env(ENV_ID, n_envs, env_kwargs={"n_train_tasks": 6, "n_test_tasks": 1})
+        model = tiny_pearl(env, n_tasks_per_rollout=6, n_episodes_per_task=1)
+        tasks: list[list[int]] = []
+
+        def note(names: dict[str, Any], _: Any, tasks: list[list[int]] = tasks) -> bool:
+            tasks.append([info["task_id"] for info in names["infos"]])
+            return True
+
+        model.learn(2 * 6 * 20, callback=note)
+        # Each env stays on its task for the 20 steps of an episode
+        rounds = np.array(tasks).reshape(-1, 20, n_envs)
+        assert (rounds == rounds[:, :1]).all()
+        first, second = rounds[:, 0].reshape(2, 6).tolist()
+        assert sorted(first) == sorted(second) == list(range(6)) and first != second
 
 
 def test_a_single_env_a_batch_and_an_id_are_the_same_to_pearl(tiny_pearl: MakePEARL) -> None:
@@ -252,20 +260,7 @@ def test_the_replay_buffer_is_saved_with_what_was_learnt_of_it(tiny_pearl: MakeP
     assert loaded.replay_buffer.size() == model.replay_buffer.size() > 0
     assert model.task_bank is not None and loaded.task_bank is not None
     np.testing.assert_array_equal(loaded.task_bank.best_return, model.task_bank.best_return)
-    a, b = model.replay_buffer.sample(4), loaded.replay_buffer.sample(4)
-    assert all((np.asarray(x) == np.asarray(y)).all() for x, y in zip(a, b, strict=True))
-
-
-def test_known_tasks_of_a_loaded_model_are_not_replaced_by_fewer(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
-    """Without its replay buffer, a model knows few tasks when training goes on."""
-    tiny_pearl().save(tmp_path / "model")
-    loaded = PEARL.load(tmp_path / "model", env=make_task_vec_env(ENV_ID, 4, env_kwargs={"goal_distance": 0.2}))
-    for n, kept in ((128, True), (1, False)):
-        known = KnownTasks(np.ones((n, 3), np.float32), np.eye(n, dtype=np.float32), np.zeros((n, n), np.float32))
-        loaded.policy.latent_prior.set_known_tasks(known)
-        loaded.learn(ROLLOUT)
-        assert 1 < len(loaded.task_bank.solved) < 128  # type: ignore[union-attr]
-        assert (len(loaded.policy.latent_prior.known_tasks().z) == n) == kept
+    assert_same(model.replay_buffer.sample(4), loaded.replay_buffer.sample(4))
 
 
 def test_schedules_end_where_they_should(tiny_pearl: MakePEARL) -> None:
@@ -300,23 +295,10 @@ def test_an_agent_that_is_not_adapted_warns_once(tiny_pearl: MakePEARL) -> None:
         evaluate_policy(model, env, n_eval_episodes=1)
 
 
-def test_normalized_observations(tiny_pearl: MakePEARL) -> None:
-    env = VecNormalize(make_task_vec_env(ENV_ID, 4), norm_reward=False)
-    model = tiny_pearl(env).learn(2 * ROLLOUT)
-    assert model.replay_buffer is not None
-    data = model.replay_buffer.sample(64, env=env)
-    raw = model.replay_buffer.sample(64)
-    assert abs(data.observations.std() - 1) < 0.5 < abs(raw.observations.std() - 1)
-
-
 def test_every_argument_is_documented() -> None:
-    import inspect
-
     for name in inspect.signature(PEARL.__init__).parameters:
         assert name == "self" or f":param {name}:" in (PEARL.__doc__ or ""), name
 
 
 def test_tiny_settings_are_real_arguments() -> None:
-    import inspect
-
     assert TINY.keys() <= inspect.signature(PEARL.__init__).parameters.keys()
