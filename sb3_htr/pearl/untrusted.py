@@ -48,7 +48,9 @@ def load_untrusted(
     settings = {name: data[name] for name in arguments & data.keys() if isinstance(data[name], int | float | str)}
     # Of an object, SB3 writes its plain attributes beside the pickle
     for name in EXPLORERS:
-        settings[name] = {key: value for key, value in data[name].items() if not key.startswith(":")}
+        explorer = data.get(name)
+        plain = isinstance(explorer, dict)
+        settings[name] = {key: explorer[key] for key in explorer if not key.startswith(":")} if plain else explorer
     given = data.get("policy_kwargs", {})
     settings["policy_kwargs"] = {name: given[name] for name in POLICY_KWARGS if name in given}
     model = PEARL("MlpPolicy", env, device=device, **{**settings, **kwargs})

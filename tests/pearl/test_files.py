@@ -4,8 +4,8 @@ import base64
 import io
 import json
 import pickle
+import threading
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,37 +13,14 @@ import cloudpickle  # type: ignore[import-untyped]
 import numpy as np
 import pytest
 import torch as th
-from conftest import ENV_ID, many
 from hypothesis import given
 from hypothesis import strategies as st
 
+from helpers import ENV_ID, ROLLOUT, MakePEARL, many
+from helpers.bombs import Bomb, bombs
 from sb3_htr import PEARL, evaluate_adaptation, load_untrusted
-from sb3_htr.common.atomic import atomic_path
+from sb3_htr.adaptation import Prior, Search
 from sb3_htr.common.vec_env import make_task_vec_env
-from sb3_htr.htr import EpisodeClustering
-from sb3_htr.pearl.untrusted import SavesToFiles
-
-MakePEARL = Callable[..., PEARL]
-ROLLOUT = 4 * 3 * 20
-
-
-class Bomb:
-    """A pickle that runs code."""
-
-    def __init__(self, fuse: Path) -> None:
-        self.fuse = fuse
-
-    def __reduce__(self) -> Any:
-        return Path.touch, (self.fuse,)
-
-
-def bombs(fuse: Path) -> list[bytes]:
-    """Files that make a mark when they are unpickled: as SB3's buffers, as torch saves, and hidden in a state dict."""
-    nested = io.BytesIO()
-    th.save({"replay": Bomb(fuse), "task_bank": {}}, nested)
-    alone = io.BytesIO()
-    th.save(Bomb(fuse), alone)
-    return [pickle.dumps(Bomb(fuse)), cloudpickle.dumps({"replay": Bomb(fuse)}), nested.getvalue(), alone.getvalue()]
 
 
 def repack(source: Path, target: Path, changed: dict[str, bytes]) -> None:
@@ -82,15 +59,25 @@ def test_loading_an_untrusted_model_runs_no_code(tiny_pearl: MakePEARL, tmp_path
     hostile: dict[str, Any] = {name: serialized for name in [*data, "learning_rate", "gamma", "replay_buffer_class"]}
     hostile["policy_kwargs"] = {**data["policy_kwargs"], "optimizer_class": serialized}
     repack(tmp_path / "model.zip", tmp_path / "bomb.zip", {"data": json.dumps(hostile).encode()})
-    load_untrusted(tmp_path / "bomb.zip", ENV_ID)  # its settings are ignored, its weights are fine
+    with pytest.raises(ValueError, match=r"explorer is {}, expected one of"):
+        load_untrusted(tmp_path / "bomb.zip", ENV_ID)
+    # Its other settings are ignored, its weights are fine
+    load_untrusted(tmp_path / "bomb.zip", ENV_ID, explorer="search", train_explorer="prior")
     assert not fuse.exists()
+    del hostile["explorer"]
+    repack(tmp_path / "model.zip", tmp_path / "bomb.zip", {"data": json.dumps(hostile).encode()})
+    with pytest.raises(ValueError, match=r"explorer is None, expected one of"):
+        load_untrusted(tmp_path / "bomb.zip", ENV_ID)
 
 
 def test_an_untrusted_model_acts_as_the_one_that_was_saved(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
-    model = tiny_pearl(gamma=0.7, kl_coef=0.02).learn(3 * ROLLOUT)
+    explorers: dict[str, Any] = {"explorer": Search(scale=2.0), "train_explorer": Prior(2)}
+    model = tiny_pearl(gamma=0.7, kl_coef=0.02, **explorers).learn(3 * ROLLOUT)
     model.save(tmp_path / "model.zip")
     loaded = load_untrusted(tmp_path / "model.zip", ENV_ID)
     assert loaded.gamma == 0.7 and loaded.kl_coef == 0.02
+    assert loaded.explorer == Search(scale=2.0) and loaded.train_explorer == Prior(2)
+    assert load_untrusted(tmp_path / "model.zip", ENV_ID, explorer="prior").explorer == Prior()
     for a, b in zip(evaluate_adaptation(model, ENV_ID), evaluate_adaptation(loaded, ENV_ID), strict=True):
         np.testing.assert_array_equal(a, b)
     with pytest.raises(ValueError, match="do not fit the env or the settings"):
@@ -122,8 +109,8 @@ def test_truncated_files_are_refused(tiny_pearl: MakePEARL, tmp_path: Path, part
 
 def test_a_replay_buffer_of_other_settings_is_refused(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
     tiny_pearl().learn(ROLLOUT).save_replay_buffer(tmp_path / "buffer")
-    with pytest.raises(ValueError, match="make the model with the replay_buffer_class that it was saved with"):
-        tiny_pearl(replay_buffer_class=EpisodeClustering).load_replay_buffer(tmp_path / "buffer")
+    with pytest.raises(ValueError, match="make the model with the relabeller that it was saved with"):
+        tiny_pearl(replay_buffer_kwargs={"relabeller": "EpisodeClustering"}).load_replay_buffer(tmp_path / "buffer")
     with pytest.raises(ValueError, match="use the settings that they were saved with"):
         tiny_pearl(buffer_size=10_000).load_replay_buffer(tmp_path / "buffer")
     with pytest.raises(ValueError, match="pass env="):
@@ -132,7 +119,7 @@ def test_a_replay_buffer_of_other_settings_is_refused(tiny_pearl: MakePEARL, tmp
 
 def test_streams_work_as_files_do(tiny_pearl: MakePEARL) -> None:
     model = tiny_pearl().learn(ROLLOUT)
-    assert isinstance(model, SavesToFiles) and model.replay_buffer is not None
+    assert model.replay_buffer is not None
     model_file, buffer_file = io.BytesIO(), io.BytesIO()
     model.save(model_file)
     model.save_replay_buffer(buffer_file)
@@ -143,9 +130,11 @@ def test_streams_work_as_files_do(tiny_pearl: MakePEARL) -> None:
     assert loaded.replay_buffer is not None and loaded.replay_buffer.size() == model.replay_buffer.size()
 
 
-def test_a_file_does_not_replace_a_folder(tmp_path: Path) -> None:
-    (tmp_path / "model.zip").mkdir()
-    (tmp_path / "model.zip" / "precious").touch()
-    with pytest.raises(OSError), atomic_path(tmp_path / "model.zip") as temporary:
-        temporary.touch()
-    assert [path.name for path in tmp_path.rglob("*")] == ["model.zip", "precious"]
+def test_a_save_that_fails_leaves_the_old_model(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    model = tiny_pearl()
+    model.save(tmp_path / "model")
+    before = (tmp_path / "model.zip").read_bytes()
+    model.not_picklable = threading.Lock()  # type: ignore[attr-defined]
+    with pytest.raises(TypeError):
+        model.save(tmp_path / "model")
+    assert (tmp_path / "model.zip").read_bytes() == before and len(list(tmp_path.iterdir())) == 1
