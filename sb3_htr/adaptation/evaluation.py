@@ -11,7 +11,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.loop import Adapts, adaptation_steps
-from sb3_htr.common.checks import get_task_family
+from sb3_htr.common.checks import check_is_not_normalized, get_task_family
 from sb3_htr.common.vec_env import make_task_vec_env
 
 
@@ -104,6 +104,7 @@ def record_adaptation(
         env = make_task_vec_env(env, max(n_tasks, 1))
     elif isinstance(env, gym.Env):
         env = BaseAlgorithm._wrap_env(env, monitor_wrapper=False)
+    check_is_not_normalized(env)
     tasks = get_task_family(env).test_tasks if tasks is None else np.asarray(tasks, dtype=np.float32)
     if tasks.ndim != 2 or len(tasks) == 0:
         raise ValueError(f"tasks have shape {tasks.shape}, expected (n_tasks, task_dim) with at least one task.")

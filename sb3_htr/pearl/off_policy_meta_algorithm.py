@@ -158,6 +158,8 @@ class OffPolicyMetaAlgorithm(SAC):
         :param env: env of the same spaces and number of copies; its task family replaces the old one if nothing was collected
         :param force_reset: reset before training goes on
         """
+        if isinstance(env, VecEnv):
+            checks.check_is_not_normalized(env)
         super().set_env(env, force_reset)
         assert self.env is not None
         if self.replay_buffer is None:
@@ -368,6 +370,7 @@ class OffPolicyMetaAlgorithm(SAC):
         vec_env = make_task_vec_env(env) if isinstance(env, str) else self._wrap_env(env, monitor_wrapper=False)
         if vec_env.num_envs != 1:
             raise ValueError(f"adapt() adapts to one task, but the VecEnv has {vec_env.num_envs} envs: pass a single env.")
+        checks.check_is_not_normalized(vec_env)
         checks.get_task_family(vec_env)
         check_for_correct_spaces(vec_env, self.observation_space, self.action_space)
         if task is None:

@@ -1,0 +1,136 @@
+"""Normalized observations: a part of the policy."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.vec_env import VecNormalize
+
+from helpers import ENV_ID, ROLLOUT, MakePEARL, parameters, with_policy
+from sb3_htr import PEARL, evaluate_adaptation, load_untrusted
+from sb3_htr.common.normalizer import ObservationNormalizer
+from sb3_htr.common.type_aliases import Context
+from sb3_htr.common.vec_env import make_task_vec_env
+
+NORMALIZED = {"policy_kwargs": with_policy(normalize_observations=True)}
+
+
+def normalizer(model: PEARL) -> ObservationNormalizer:
+    assert model.policy.normalizer is not None
+    return model.policy.normalizer
+
+
+@pytest.fixture
+def trained(tiny_pearl: MakePEARL) -> PEARL:
+    return tiny_pearl(**NORMALIZED).learn(2 * ROLLOUT)
+
+
+def test_statistics_follow_what_is_acted_on_in_training(tiny_pearl: MakePEARL) -> None:
+    """All of it, also what is acted on at random, and nothing else: not what an episode ends with."""
+    acted_on: list[np.ndarray] = []
+
+    def note(names: dict[str, Any], _: Any) -> bool:
+        acted_on.append(names["step"].observations.copy())
+        return True
+
+    model = tiny_pearl(**NORMALIZED).learn(2 * ROLLOUT, callback=note)
+    obs = np.concatenate(acted_on)
+    assert len(obs) == model.num_timesteps == 2 * ROLLOUT
+    np.testing.assert_allclose(normalizer(model).count, len(obs), rtol=1e-6)
+    np.testing.assert_allclose(normalizer(model).mean, obs.mean(axis=0), atol=1e-6)
+    np.testing.assert_allclose(normalizer(model).variance, obs.var(axis=0), rtol=1e-5)
+    assert model.replay_buffer is not None
+    rows = model.replay_buffer.episodes.take(np.arange(model.replay_buffer.size()))
+    stored = rows[:, model.replay_buffer.transitions.observation]
+    np.testing.assert_array_equal(np.sort(stored, axis=0), np.sort(obs, axis=0), err_msg="they are stored as they were")
+
+
+def test_every_network_sees_normalized_observations(trained: PEARL, tiny_pearl: MakePEARL) -> None:
+    """With them, networks without normalization do the same."""
+    plain = tiny_pearl()
+    weights = {key: value for key, value in trained.policy.state_dict().items() if not key.startswith("normalizer.")}
+    plain.policy.load_state_dict(weights)
+    obs = np.random.default_rng(0).normal(0, 0.5, (9, 2)).astype(np.float32)
+    z = np.random.default_rng(1).normal(size=(9, 3)).astype(np.float32)
+    mean, variance = normalizer(trained).mean.numpy(), normalizer(trained).variance.numpy()
+    by_hand = np.clip((obs - mean) / np.sqrt(variance + 1e-8), -10, 10).astype(np.float32)
+    assert np.abs(by_hand - obs).max() > 0.5
+    np.testing.assert_allclose(trained.policy.act(obs, z, True), plain.policy.act(by_hand, z, True), atol=1e-5)
+    ours, _ = trained.predict(obs, (z,), deterministic=True)
+    np.testing.assert_allclose(ours, plain.predict(by_hand, (z,), deterministic=True)[0], atol=1e-5)
+    actions, rewards, lengths = th.from_numpy(z[:, :2]), th.ones(9), th.tensor([4, 5])
+    with th.no_grad():
+        a = trained.policy.infer(Context(th.from_numpy(obs), actions, rewards, lengths))
+        b = plain.policy.infer(Context(th.from_numpy(by_hand), actions, rewards, lengths))
+    for x, y in zip(a, b, strict=True):
+        th.testing.assert_close(x, y, rtol=1e-4, atol=1e-5)
+
+
+def test_updates_see_normalized_observations(trained: PEARL, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[th.Tensor] = []
+    critic = trained.critic.forward
+
+    def noting(obs_z: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        seen.append(obs_z[:, :2].detach())
+        return critic(obs_z, actions)
+
+    monkeypatch.setattr(trained.critic, "forward", noting)
+    data = trained.replay_buffer.sample(4, meta_batch_size=8)  # type: ignore[union-attr]
+    monkeypatch.setattr(trained.replay_buffer, "sample", lambda *_, **__: data)
+    trained._update(4)
+    expected = normalizer(trained)(data.observations)
+    assert len(seen) == 2 and all(th.equal(obs, expected) for obs in seen)
+
+
+def test_evaluation_leaves_them_alone(trained: PEARL) -> None:
+    before = parameters(trained)
+    evaluate_adaptation(trained, ENV_ID, n_episodes=2)
+    trained.predict(np.full(2, 99.0, np.float32), (np.zeros((1, 3), np.float32),))
+    trained.train(2, 4)
+    after = parameters(trained)
+    statistics = [name for name in before if name.startswith("normalizer.")]
+    assert len(statistics) == 3 and all(th.equal(before[name], after[name]) for name in statistics)
+
+
+def test_they_are_saved_with_the_weights(trained: PEARL, tmp_path: Path) -> None:
+    trained.save(tmp_path / "model")
+    expected = evaluate_adaptation(trained, ENV_ID, n_episodes=3)
+    policy = type(trained.policy)
+    trained.policy.save(str(tmp_path / "policy"))
+    for loaded in (PEARL.load(tmp_path / "model"), load_untrusted(tmp_path / "model.zip", ENV_ID)):
+        assert all(th.equal(value, parameters(trained)[name]) for name, value in parameters(loaded).items())
+        for ours, theirs in zip(evaluate_adaptation(loaded, ENV_ID, n_episodes=3), expected, strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+    alone = policy.load(str(tmp_path / "policy"))
+    assert th.equal(alone.normalize(th.ones(1, 2)), trained.policy.normalize(th.ones(1, 2)))
+
+
+def test_without_it_observations_are_as_they_are(tiny_pearl: MakePEARL) -> None:
+    policy = tiny_pearl().learn(ROLLOUT).policy
+    assert policy.normalizer is None and policy.normalize(obs := th.randn(3, 2)) is obs
+    assert not [name for name in policy.state_dict() if name.startswith("normalizer")]
+
+
+@pytest.mark.parametrize("kwargs", [{}, {"norm_reward": False}, {"norm_obs": False, "norm_reward": False}])
+def test_vec_normalize_is_refused(tiny_pearl: MakePEARL, kwargs: dict[str, Any], tmp_path: Path) -> None:
+    """At once, and not only where a model is made."""
+    message = r"VecNormalize stands between .*policy_kwargs={'normalize_observations': True}"
+    with pytest.raises(ValueError, match=message):
+        tiny_pearl(VecNormalize(make_task_vec_env(ENV_ID, 4), **kwargs))
+    tiny_pearl().save(tmp_path / "model")
+    with pytest.raises(ValueError, match=message):
+        PEARL.load(tmp_path / "model", env=VecNormalize(make_task_vec_env(ENV_ID, 4), **kwargs))
+    loaded = PEARL.load(tmp_path / "model")
+    with pytest.raises(ValueError, match=message):
+        loaded.set_env(VecNormalize(make_task_vec_env(ENV_ID, 4), **kwargs))
+    model = tiny_pearl()
+    with pytest.raises(ValueError, match=message):
+        model.set_env(VecNormalize(make_task_vec_env(ENV_ID, 4), **kwargs))
+    assert not isinstance(model.env, VecNormalize)
+    # It would act on other numbers than in training, and scores would be of other rewards
+    with pytest.raises(ValueError, match=message):
+        evaluate_adaptation(model, VecNormalize(make_task_vec_env(ENV_ID, 4), **kwargs))
+    with pytest.raises(ValueError, match=message):
+        model.adapt(VecNormalize(make_task_vec_env(ENV_ID, 1), **kwargs))
