@@ -45,7 +45,7 @@ from sb3_htr.zoo.run.yaml_values import without_code
 
 PACKAGES = ("sb3_htr", "stable_baselines3", "gymnasium", "rl_zoo3", "torch", "numpy", "mujoco")
 # What a YAML file may have beside the arguments of PEARL
-ZOO_SETTINGS = ("n_envs", "n_timesteps", "method", "env_wrapper", "vec_env_wrapper", "callback", "env_kwargs")
+ZOO_SETTINGS = ("n_envs", "n_timesteps", "env_wrapper", "vec_env_wrapper", "callback", "env_kwargs")
 # Tasks that an evaluation adapts to side by side
 N_EVAL_ENVS = 20
 
@@ -70,11 +70,13 @@ class MetaExperimentManager(ExperimentManager):
         """
         if self.n_timesteps != -1:
             check_numbers(n_timesteps=(self.n_timesteps, 1, float("inf")))
-        given, trial_id = self.custom_hyperparams or {}, self.trial_id
+        given, trial_id = dict(self.custom_hyperparams or {}), self.trial_id
         self.custom_hyperparams, self.trial_id = None, None
         with redirect_stdout(StringIO()):  # it prints what is not all of it
             hyperparams, _ = super().read_hyperparameters()
-        self.method = get_method(self._method_name or hyperparams.pop("method", DEFAULT))
+        in_file = hyperparams.pop("method", DEFAULT)
+        in_params = given.pop("method", in_file)
+        self.method = get_method(self._method_name or in_params)
         hyperparams = merged(without_code(hyperparams), self.method.hyperparams())
         hyperparams = merged(merged(hyperparams, self._trial(trial_id)), given)
         saved = OrderedDict(sorted(hyperparams.items()))

@@ -1,0 +1,227 @@
+"""A method is one name, from the command line to the model card."""
+
+import copy
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from helpers import ENV_ID, TINY, MakePEARL
+from helpers.runs import make_run, run_folder, train_arguments
+from sb3_htr import PEARL
+from sb3_htr.adaptation import Prior, Search
+from sb3_htr.htr import EpisodeClustering, SingleEpisodeRelabelling
+from sb3_htr.zoo.cli import main
+from sb3_htr.zoo.run.agents import RECORD, agent_for
+from sb3_htr.zoo.run.method import get_method, merged, methods
+
+OWN = ["htr-ser", "htr-ec", "pearl-dense", "pearl-sparse"]
+
+
+def test_what_the_methods_are() -> None:
+    assert list(methods()) == [*OWN, *(f"{name}-prior" for name in OWN)]
+    relabelling = {name: method.relabel_probability > 0 for name, method in methods().items()}
+    dense = {name for name, method in methods().items() if method.rl_reward_type == "dense"}
+    assert relabelling == {name: name.startswith("htr") for name in methods()}
+    assert dense == {"pearl-dense", "pearl-dense-prior"}
+    for name in OWN:
+        method, prior = get_method(name), get_method(f"{name}-prior")
+        assert (method.train_explorer, method.explorer) == ("aggregate", "search"), "methods differ in one thing at a time"
+        assert (prior.train_explorer, prior.explorer) == ("prior", "prior") and "PEARL's protocol" in prior.label
+        assert merged(prior.hyperparams(), {key: method.hyperparams()[key] for key in ("explorer", "train_explorer")}) == (
+            method.hyperparams()
+        )
+    with pytest.raises(ValueError, match=r"The method is 'htr', expected one of htr-ser, htr-ec, .*pearl-sparse-prior\."):
+        get_method("htr")
+
+
+@pytest.mark.parametrize("name", methods())
+def test_every_method_trains_as_what_it_says(name: str) -> None:
+    method = get_method(name)
+    model = PEARL("MlpPolicy", ENV_ID, **merged(TINY, method.hyperparams())).learn(480)
+    assert model.replay_buffer is not None
+    assert type(model.replay_buffer.relabeller).__name__ == method.relabeller
+    assert model.replay_buffer.relabel_probability == method.relabel_probability
+    assert model.replay_buffer.rl_reward_type == method.rl_reward_type
+    assert (model.train_explorer.name, model.explorer.name) == (method.train_explorer, method.explorer)
+
+
+# --- nested settings are joined
+
+nested = st.recursive(st.integers(), lambda inner: st.dictionaries(st.sampled_from("abc"), inner, max_size=3), max_leaves=8)
+trees = st.dictionaries(st.sampled_from("abc"), nested, max_size=3)
+
+
+def paths(tree: Any) -> dict[tuple[str, ...], Any]:
+    """Every setting by its path."""
+    if not isinstance(tree, dict) or not tree:
+        return {(): tree}
+    return {(key, *path): value for key, inner in tree.items() for path, value in paths(inner).items()}
+
+
+@given(trees, trees)
+def test_the_second_wins_and_nothing_else_of_the_first_is_lost(first: dict[str, Any], second: dict[str, Any]) -> None:
+    before = copy.deepcopy((first, second))
+    result = paths(merged(first, second))
+    ours, theirs = paths(first), paths(second)
+    leaves = {path: value for path, value in theirs.items() if value != {}}
+    assert all(result[path] == value for path, value in leaves.items())
+    for path, value in ours.items():
+        hidden = any(path[: len(other)] == other or other[: len(path)] == path for other in theirs)
+        assert hidden or result[path] == value
+    assert result.keys() <= {*ours, *theirs, ()}
+    assert (first, second) == before, "neither is changed"
+
+
+def test_a_name_and_settings_of_what_it_names_are_joined() -> None:
+    settings = {"relabeller": "EpisodeClustering", "n": 1}
+    joined = merged(settings, {"relabeller": {"cell_size": 0.2}})
+    assert joined == {"relabeller": {"name": "EpisodeClustering", "cell_size": 0.2}, "n": 1}
+    assert merged(joined, {"relabeller": {"name": "SingleEpisodeRelabelling"}})["relabeller"]["name"] == (
+        "SingleEpisodeRelabelling"
+    )
+    assert merged(joined, {"relabeller": "SingleEpisodeRelabelling"}) == {"relabeller": "SingleEpisodeRelabelling", "n": 1}
+
+
+def test_settings_of_file_method_and_command_line_are_joined_in_this_order(tmp_path: Path) -> None:
+    block: dict[str, Any] = {key: value for key, value in TINY.items() if key != "seed"}
+    block |= {"policy": "MlpPolicy", "n_timesteps": 240, "n_envs": 4, "explorer": {"name": "prior", "scale": 2.5}}
+    block["replay_buffer_kwargs"] = {
+        "relabeller": {"name": "SingleEpisodeRelabelling", "hindsight_task_strategy": "final"},
+        "relabel_probability": 0.1,
+        "context_episodes": 3,
+    }
+    (tmp_path / "my.yml").write_text(yaml.safe_dump({ENV_ID: block}))
+    arguments = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(tmp_path / "my.yml"), "--eval-freq", "-1"]
+    given = ["replay_buffer_kwargs:{'relabeller':{'cell_size':0.3}}", "explorer:{'max_setbacks':2}"]
+    assert main([*arguments, "--verbose", "0", "--method", "htr-ec", "-params", *given]) == 0
+    run = run_folder(tmp_path, "htr-ec")
+    buffer = {"relabel_probability": 0.8, "rl_reward_type": "sparse", "context_episodes": 3}
+    relabeller = {"name": "EpisodeClustering", "hindsight_task_strategy": "final", "cell_size": 0.3}
+    model = PEARL.load(run / f"{ENV_ID}.zip")
+    assert model.replay_buffer_kwargs == {**buffer, "relabeller": relabeller}
+    assert model.explorer == Search(scale=2.5, max_setbacks=2)
+    record = json.loads((run / RECORD).read_text())
+    assert record["hyperparams"]["replay_buffer_kwargs"] == {**buffer, "relabeller": relabeller}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--method", "htr"], "The method is 'htr', expected one of htr-ser"),
+        (["-params", "method:'pearl'"], "The method is 'pearl', expected one of htr-ser"),
+        (["-params", "replay_buffer_kwargs:{'cell_size':0.3}"], "replay_buffer_kwargs has no setting 'cell_size'"),
+        (
+            ["-params", "replay_buffer_kwargs:{'relabeller':{'cell_size':0.3}}"],
+            "'SingleEpisodeRelabelling' has no setting 'ce",
+        ),
+        (["--method", "htr-ec", "-params", "replay_buffer_kwargs:{'relabeller':{'rl_batch_source':'task'}}"], "'EpisodeClu"),
+        (["-params", "explorer:{'scal':0.3}"], "explorer 'search' has no setting 'scal': did you mean scale"),
+        (["-params", "explorer:'nobody'"], "explorer is 'nobody', expected one of"),
+        (["-params", "n_exploration_episodes:3"], "PEARL has no setting 'n_exploration_episodes'"),
+        (
+            ["-params", "normalize:True"],
+            "normalize asks for SB3's VecNormalize.*policy_kwargs: {normalize_observations: true}",
+        ),
+        (["-params", "normalize:{'norm_reward':False}"], "normalize asks for SB3's VecNormalize"),
+    ],
+)
+def test_what_is_not_known_is_refused_in_one_sentence(arguments: list[str], message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=message) as refusal:
+        main(["train", "--env", ENV_ID, "-f", str(tmp_path), "-n", "240", "--verbose", "0", *arguments])
+    assert "\n" not in str(refusal.value) and not list(tmp_path.rglob("*.zip"))
+
+
+# --- one name all the way
+
+
+@pytest.mark.parametrize("name", ["htr-ec", "pearl-sparse-prior"])
+def test_the_name_is_recorded_and_stays_with_the_agent(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In the folder, in run.json, through a resume, in the exported file and its card, and in what it says to train it."""
+    monkeypatch.chdir(tmp_path)
+    goals = ["--method", name, "--save-freq", "240", "--env-kwargs", "goal_distance:0.05"]
+    assert main(train_arguments(Path("logs"), 480, *goals, eval_freq=480)) == 0
+    run = run_folder(Path("logs"), name)
+    record = json.loads((run / RECORD).read_text())
+    assert record["method"] == name
+    assert main(["train", "--resume", str(run)]) == 0
+    assert [path.name for path in Path("logs").iterdir()] == [name], "it goes on where it was"
+    assert main(["export", str(run), "-o", "agent", "--n-episodes", "2"]) == 0
+    with zipfile.ZipFile(f"agent/{ENV_ID}.zip") as archive:
+        exported = json.loads(archive.read(RECORD))
+    assert exported["method"] == name and f"--method {name}" in exported["command"]
+    card = Path("agent/README.md").read_text()
+    metadata = yaml.safe_load(card.split("---")[1])
+    assert metadata["model-index"][0]["name"] == name and f"\n# {name} on {ENV_ID}\n" in card
+    assert ("with Hindsight Task Relabelling" in card) == name.startswith("htr")
+    assert agent_for(ENV_ID, "logs", name).method == name
+    capsys.readouterr()
+    assert main(["enjoy", "--env", ENV_ID, "--method", name, "--no-render", "--n-tasks", "1", "--n-episodes", "1"]) == 0
+    assert f"logs/{name}/" in capsys.readouterr().out
+
+
+def test_enjoy_takes_the_agent_of_the_method_that_is_asked_for(
+    tmp_path: Path, tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    few = ["enjoy", "--env", ENV_ID, "--no-render", "--n-tasks", "1", "--n-episodes", "1"]
+    make_run(Path("logs"), tiny_pearl(explorer=Prior(1)), method="pearl-sparse-prior")
+    make_run(Path("logs"), tiny_pearl(), method="htr-ec")
+    said = {}
+    for name in ("htr-ec", "pearl-sparse-prior", "pearl-dense"):
+        assert main([*few, "--method", name]) == 0
+        said[name] = capsys.readouterr().out.splitlines()[0]
+    assert said["htr-ec"].startswith("logs/htr-ec/") and said["htr-ec"].endswith("explorer 'search'")
+    assert said["pearl-sparse-prior"].startswith("logs/pearl-sparse-prior/")
+    assert said["pearl-sparse-prior"].endswith("explorer 'prior'")
+    assert f"trained_agents/pearl-dense/{ENV_ID}.zip" in said["pearl-dense"], "there is none in the logs, so the shipped one"
+    assert main(few) == 0
+    assert "logs/htr-ec/" in capsys.readouterr().out, "without a name, the first that there is"
+    with pytest.raises(ValueError, match="The method is 'htr', expected one of"):
+        main([*few, "--method", "htr"])
+    with pytest.raises(FileNotFoundError, match=f"no trained agent for {ENV_ID} by pearl-dense-prior in logs/"):
+        main([*few, "--method", "pearl-dense-prior"])
+
+
+def test_a_method_may_stand_in_the_yaml_file_and_among_the_params(tmp_path: Path) -> None:
+    block: dict[str, Any] = {key: value for key, value in TINY.items() if key != "seed"}
+    block |= {"policy": "MlpPolicy", "n_timesteps": 240, "n_envs": 4, "method": "htr-ec-prior"}
+    (tmp_path / "my.yml").write_text(yaml.safe_dump({ENV_ID: block}))
+    arguments = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(tmp_path / "my.yml"), "--eval-freq", "-1"]
+    in_params = ["-params", "method:'pearl-sparse'"]
+    for given, expected in (
+        ([], "htr-ec-prior"),
+        (in_params, "pearl-sparse"),
+        (["--method", "htr-ser", *in_params], "htr-ser"),
+    ):
+        assert main([*arguments, "--verbose", "0", *given]) == 0
+        record = json.loads((run_folder(tmp_path, expected) / RECORD).read_text())
+        assert record["method"] == expected and "method" not in record["hyperparams"]
+
+
+# --- objects are settings
+
+
+@pytest.mark.parametrize("relabeller", [EpisodeClustering(cell_size=0.2), SingleEpisodeRelabelling("final")])
+def test_relabellers_given_to_two_models_are_not_shared(tiny_pearl: MakePEARL, relabeller: Any) -> None:
+    before = dict(vars(relabeller))
+    models = [tiny_pearl(seed=seed, replay_buffer_kwargs={"relabeller": relabeller}) for seed in (1, 2)]
+    buffers = [model.replay_buffer for model in models]
+    assert buffers[0] is not None and buffers[1] is not None
+    ours, theirs = buffers[0].relabeller, buffers[1].relabeller
+    assert ours is not theirs is not relabeller is not ours
+    models[0].learn(480)
+    assert vars(relabeller) == before, "it holds settings, and is as it was"
+    assert ours.buffer is buffers[0] and theirs.buffer is buffers[1] and ours.policy is models[0].policy
+    if isinstance(ours, EpisodeClustering) and isinstance(theirs, EpisodeClustering):
+        assert ours.n_hindsight_buffers > 0 == theirs.n_hindsight_buffers
+        assert ours.discretiser is relabeller.discretiser is theirs.discretiser
+    alone = tiny_pearl(seed=2).replay_buffer
+    assert alone is not None and buffers[1].size() == alone.size() == 0
