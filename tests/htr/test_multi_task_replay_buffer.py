@@ -10,8 +10,10 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
+from helpers import MakePEARL
 from helpers.experience import FAMILY, add_episode, assert_same, by_task, filled, make_buffer
 from htr_envs import PointRobotFamily
+from sb3_htr.htr import EpisodeClustering, SingleEpisodeRelabelling
 from sb3_htr.htr.multi_task_replay_buffer import spread
 from sb3_htr.htr.transitions import Transitions
 
@@ -159,6 +161,27 @@ def test_actions_reach_the_reward_hook_in_the_bounds_of_the_env() -> None:
     rows = np.zeros((3, transitions.width), dtype=np.float32)
     rows[:, transitions.action] = [[-1, -1], [0, 0], [1, 1]]
     np.testing.assert_allclose(transitions.trajectory(rows).actions, [[0, -3], [1, 1], [2, 5]])
+
+
+# --- objects are settings
+
+
+@pytest.mark.parametrize("relabeller", [EpisodeClustering(cell_size=0.2), SingleEpisodeRelabelling("final")])
+def test_relabellers_given_to_two_models_are_not_shared(tiny_pearl: MakePEARL, relabeller: Any) -> None:
+    before = dict(vars(relabeller))
+    models = [tiny_pearl(seed=seed, replay_buffer_kwargs={"relabeller": relabeller}) for seed in (1, 2)]
+    buffers = [model.replay_buffer for model in models]
+    assert buffers[0] is not None and buffers[1] is not None
+    ours, theirs = buffers[0].relabeller, buffers[1].relabeller
+    assert ours is not theirs is not relabeller is not ours
+    models[0].learn(480)
+    assert vars(relabeller) == before, "it holds settings, and is as it was"
+    assert ours.buffer is buffers[0] and theirs.buffer is buffers[1] and ours.policy is models[0].policy
+    if isinstance(ours, EpisodeClustering) and isinstance(theirs, EpisodeClustering):
+        assert ours.n_hindsight_buffers > 0 == theirs.n_hindsight_buffers
+        assert ours.discretiser is relabeller.discretiser is theirs.discretiser
+    alone = tiny_pearl(seed=2).replay_buffer
+    assert alone is not None and buffers[1].size() == alone.size() == 0
 
 
 # --- bad input

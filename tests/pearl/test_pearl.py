@@ -70,7 +70,7 @@ def test_the_actor_does_not_shape_z(tiny_pearl: MakePEARL) -> None:
     obs_dim, latent_dim = 2, model.policy.latent_dim
     with th.no_grad():
         for network in (*model.critic.networks, *model.critic_target.networks):
-            network[0].weight[:, obs_dim : obs_dim + latent_dim] = 0  # type: ignore[index]
+            network[0].weight[:, obs_dim : obs_dim + latent_dim] = 0
     before = parameters(model)
     model._update(4)
     assert all(p.grad is not None and not p.grad.any() for p in model.encoder.parameters())

@@ -15,7 +15,6 @@ from helpers import ENV_ID, TINY, MakePEARL
 from helpers.runs import make_run, run_folder, train_arguments
 from sb3_htr import PEARL
 from sb3_htr.adaptation import Prior, Search
-from sb3_htr.htr import EpisodeClustering, SingleEpisodeRelabelling
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run.agents import RECORD, agent_for
 from sb3_htr.zoo.run.method import get_method, merged, methods
@@ -196,32 +195,11 @@ def test_a_method_may_stand_in_the_yaml_file_and_among_the_params(tmp_path: Path
     (tmp_path / "my.yml").write_text(yaml.safe_dump({ENV_ID: block}))
     arguments = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(tmp_path / "my.yml"), "--eval-freq", "-1"]
     in_params = ["-params", "method:'pearl-sparse'"]
-    for given, expected in (
+    for more, expected in (
         ([], "htr-ec-prior"),
         (in_params, "pearl-sparse"),
         (["--method", "htr-ser", *in_params], "htr-ser"),
     ):
-        assert main([*arguments, "--verbose", "0", *given]) == 0
+        assert main([*arguments, "--verbose", "0", *more]) == 0
         record = json.loads((run_folder(tmp_path, expected) / RECORD).read_text())
         assert record["method"] == expected and "method" not in record["hyperparams"]
-
-
-# --- objects are settings
-
-
-@pytest.mark.parametrize("relabeller", [EpisodeClustering(cell_size=0.2), SingleEpisodeRelabelling("final")])
-def test_relabellers_given_to_two_models_are_not_shared(tiny_pearl: MakePEARL, relabeller: Any) -> None:
-    before = dict(vars(relabeller))
-    models = [tiny_pearl(seed=seed, replay_buffer_kwargs={"relabeller": relabeller}) for seed in (1, 2)]
-    buffers = [model.replay_buffer for model in models]
-    assert buffers[0] is not None and buffers[1] is not None
-    ours, theirs = buffers[0].relabeller, buffers[1].relabeller
-    assert ours is not theirs is not relabeller is not ours
-    models[0].learn(480)
-    assert vars(relabeller) == before, "it holds settings, and is as it was"
-    assert ours.buffer is buffers[0] and theirs.buffer is buffers[1] and ours.policy is models[0].policy
-    if isinstance(ours, EpisodeClustering) and isinstance(theirs, EpisodeClustering):
-        assert ours.n_hindsight_buffers > 0 == theirs.n_hindsight_buffers
-        assert ours.discretiser is relabeller.discretiser is theirs.discretiser
-    alone = tiny_pearl(seed=2).replay_buffer
-    assert alone is not None and buffers[1].size() == alone.size() == 0
