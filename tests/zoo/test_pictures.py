@@ -6,22 +6,24 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from broken_envs import LineEnv
-from conftest import ENV_ID, TINY
 from gymnasium.envs.registration import EnvSpec
 from matplotlib.figure import Figure
 
+from helpers import ENV_ID, TINY, MakePEARL
+from helpers.broken_envs import LineEnv
+from helpers.runs import NOWHERE, make_run
 from sb3_htr import PEARL
 from sb3_htr.adaptation.evaluation import AdaptationRecord
-from sb3_htr.zoo import curves, intervals, plots
 from sb3_htr.zoo.cli import main
+from sb3_htr.zoo.commands.plot import check_same_settings
+from sb3_htr.zoo.plots import adaptation, curves
 
 
 @pytest.fixture
 def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
     """Figures that are saved."""
     figures: list[Figure] = []
-    for module in (plots, curves):
+    for module in (adaptation, curves):
         monkeypatch.setattr(module, "save", lambda figure, path: figures.append(figure))
     return figures
 
@@ -35,7 +37,7 @@ class Boastful(LineEnv):
 @pytest.fixture
 def line_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An agent of an env as in docs/own_task_family.md: its constructor knows no render_mode."""
-    spec = EnvSpec("SparseLine-v0", "broken_envs:LineEnv", max_episode_steps=10)
+    spec = EnvSpec("SparseLine-v0", "helpers.broken_envs:LineEnv", max_episode_steps=10)
     monkeypatch.setitem(gym.registry, spec.id, spec)
     path = tmp_path / "line.zip"
     PEARL("MlpPolicy", gym.make("SparseLine-v0"), **TINY).save(path)
@@ -54,6 +56,7 @@ def test_an_env_that_cannot_be_drawn_can_be_played(
         assert "SparseLine-v0 cannot draw itself" in capsys.readouterr().out
         assert main(["plot", *arguments, "--n-episodes", "2", "-o", str(tmp_path / "plots")]) == 0
         assert main(["export", *arguments, "-o", str(tmp_path / "agent"), "--n-episodes", "2"]) == 0
+        assert "# PEARL on SparseLine-v0" in (tmp_path / "agent" / "README.md").read_text()
     with pytest.raises(ValueError, match="SparseLine-v0 cannot be filmed: 'rgb_array' is not in"):
         main(["record", *arguments, "-o", str(tmp_path / "film.mp4")])
     monkeypatch.setattr(gym.registry["SparseLine-v0"], "entry_point", Boastful)
@@ -64,9 +67,9 @@ def test_an_env_that_cannot_be_drawn_can_be_played(
 def test_paths_begin_at_the_start_and_name_their_task(drawn: list[Figure]) -> None:
     tasks = np.array([[0.0, 1.0], [1.0, 0.0]], dtype=np.float32)
     record = AdaptationRecord(np.ones((2, 3)), np.ones((2, 3), dtype=bool), np.full((2, 3, 4, 2), 0.5, dtype=np.float32))
-    start = plots.start_position(gym.make(ENV_ID))
+    start = adaptation.start_position(gym.make(ENV_ID))
     assert start is not None
-    plots.plot_adaptation_paths(record, tasks, 0.2, start, Path("x.png"), "about")
+    adaptation.plot_adaptation_paths(record, tasks, 0.2, start, Path("x.png"), "about")
     axes = drawn[0].axes[0]
     assert axes.get_title().startswith("task 2: solved in episode 1")
     ways = [np.asarray(line.get_xydata()) for line in axes.lines]
@@ -74,7 +77,7 @@ def test_paths_begin_at_the_start_and_name_their_task(drawn: list[Figure]) -> No
 
 
 def test_curves_say_what_they_show(drawn: list[Figure], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(intervals, "REPS", 200)
+    monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 200)
     for n_seeds, n_points, said in (
         (1, 16, "env"),
         (2, 15, "env; mean and range of 2 seeds"),
@@ -88,3 +91,31 @@ def test_curves_say_what_they_show(drawn: list[Figure], monkeypatch: pytest.Monk
         assert left.lines[0].get_marker() == ("" if n_points > 15 else "o")
         assert left.get_ylim()[1] >= 1 and left.get_ylim()[0] < 0, "zeros are no noise"
         assert right.get_ylim() == (-4, 104)
+
+
+def test_plot_draws_all_pictures_of_an_agent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plot", *NOWHERE, "--n-episodes", "6", "-o", str(tmp_path)]) == 0
+    names = {"adaptation_curve.png", "adaptation_paths.png", "latent_space.png"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+    assert all(path.stat().st_size > 10_000 for path in tmp_path.iterdir())
+    assert "No learning curves" in capsys.readouterr().out
+
+
+def test_plot_draws_seeds_as_one_curve(
+    tmp_path: Path, tiny_pearl: MakePEARL, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 50)
+    folders = [tmp_path / "one", tmp_path / "other"]
+    for folder in folders:
+        for number in (1, 2):
+            make_run(folder, tiny_pearl(seed=number), number)
+    arguments = [*map(str, folders), "--n-episodes", "2", "-o", str(tmp_path / "plots")]
+    assert main(["plot", *arguments]) == 0
+    output = capsys.readouterr().out
+    assert "learning_curves.png" in output and "adaptation_curve.png" in output and "No latent space: one found" in output
+    with pytest.raises(ValueError, match="--labels needs one name of its own for each of the 2 folders"):
+        main(["plot", *arguments, "-l", "same", "same"])
+    with pytest.raises(ValueError, match=r"The runs in one differ in \['gamma'\]"):
+        make_run(folders[0], tiny_pearl(), 3, hyperparams={"explorer": {"name": "search"}, "gamma": 0.5})
+        main(["plot", *arguments])
+    check_same_settings("none", [])

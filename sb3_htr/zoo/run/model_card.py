@@ -68,7 +68,8 @@ def model_card(record: dict[str, Any], scores: dict[str, AdaptationRecord], repo
     :param repo_id: where it will be on the Hugging Face Hub
     :return: content of ``README.md``
     """
-    env_id, name = record["env_id"], record["method"]
+    # A model file of one's own names no method
+    env_id, name = record["env_id"], record.get("method", "PEARL")
     explorer, adapted = next(iter(scores.items()))
     n_tasks, n_episodes = adapted.returns.shape
     returns = adapted.returns[:, -1]

@@ -1,0 +1,101 @@
+"""Agents watched and filmed."""
+
+from pathlib import Path
+
+import gymnasium as gym
+import imageio.v3 as iio
+import numpy as np
+import pytest
+
+from helpers import ENV_ID, MakePEARL
+from helpers.runs import NOWHERE, SHIPPED
+from sb3_htr import PEARL, evaluate_adaptation
+from sb3_htr.zoo.cli import main
+from sb3_htr.zoo.show.captions import Captioner
+from sb3_htr.zoo.show.play import Moment, Player
+
+
+def test_enjoy_shows_an_agent_that_adapts(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["enjoy", *NOWHERE, "--no-render", "--n-tasks", "50", "--n-episodes", "1"]) == 0
+    assert "There are only 20 test tasks, fewer than --n-tasks 50" in capsys.readouterr().out
+    assert main(["enjoy", *NOWHERE, "--no-render", "--n-tasks", "2", "--n-episodes", "6"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    episodes = [line for line in lines if line.startswith("  episode")]
+    assert len(episodes) == 12 and "explores" in episodes[6] and "adapted" in episodes[11] and "solved" in episodes[11]
+    deviations = [float(line.split()[-1]) for line in episodes]
+    assert deviations[11] < 0.2 * deviations[6], "z is known better once the task is"
+    assert lines[-1].startswith("Solved 2 of 2 tasks")
+
+
+def test_enjoy_needs_no_screen(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["enjoy", *NOWHERE, "--task", "3", "--n-episodes", "1"]) == 0
+    output = capsys.readouterr().out
+    assert "Numbers only: no screen" in output and "test task 3 of 20" in output
+
+
+def test_enjoy_ends_with_its_window_or_its_steps(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    shown: list[np.ndarray] = []
+
+    class Window:
+        def __init__(self, title: str, fps: float) -> None:
+            assert ENV_ID in title and fps == 10
+
+        def show(self, frame: np.ndarray) -> bool:
+            shown.append(frame)
+            return len(shown) < 30
+
+        def close(self) -> None:
+            shown.append(np.zeros(0))
+
+    monkeypatch.setattr("sb3_htr.zoo.show.window.Window", Window)
+    assert main(["enjoy", *NOWHERE]) == 0
+    assert len(shown) == 31 and shown[0].shape == shown[29].shape and (shown[0] != shown[29]).any()
+    assert main(["enjoy", *NOWHERE, "-n", "45", "--no-render"]) == 0
+    assert capsys.readouterr().out.splitlines()[-2].startswith("  episode   2")
+
+
+@pytest.mark.parametrize("explorer", ["search", "prior", "aggregate"])
+def test_what_is_played_is_what_is_evaluated(explorer: str) -> None:
+    model, env = PEARL.load(SHIPPED), gym.make(ENV_ID)
+    tasks = env.unwrapped.task_family.test_tasks  # type: ignore[attr-defined]
+    returns, successes = evaluate_adaptation(model, env, tasks[4:5], n_episodes=7, explorer=explorer, seed=3)
+    moments = list(Player(model, env, explorer, seed=3).play(tasks, 5, 7))
+    np.testing.assert_allclose(moments[-1].returns, returns[0], atol=1e-5)
+    assert moments[-1].successes == tuple(successes[0]) and len(moments) == 7 * 21
+    before = [moment.deviation for moment in moments if moment.exploring and not moment.ended]
+    assert min(before) > 0.1 and (explorer != "prior" or set(before) == {1.0})
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+def test_record_makes_a_film(suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    film = tmp_path / f"film{suffix}"
+    arguments = ["--n-tasks", "1", "--n-episodes", "2", "--every", "5", "-o", str(film), "--verbose", "0"]
+    assert main(["record", *NOWHERE, *arguments]) == 0
+    frames = iio.imread(film)
+    assert "10 frames" in capsys.readouterr().out and len(frames) >= 9
+    height, width = frames.shape[1:3]
+    assert width == 400 and 400 < height < 520 and height % 2 == 0
+    assert (frames[0, :400] != frames[-1, :400]).any(), "the robot moves"
+    assert (frames[0, 400:] != frames[-1, 400:]).any(), "and so does the caption"
+
+
+def test_films_that_cannot_be_made(tmp_path: Path, tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ValueError, match=r"the suffix '.avi', expected one of .mp4, .gif"):
+        main(["record", *NOWHERE, "-o", "film.avi"])
+    with pytest.raises(ValueError, match="--every is 0"):
+        main(["record", *NOWHERE, "--every", "0"])
+    monkeypatch.setattr("sb3_htr.zoo.show.film.MAX_GIF_FRAMES", 5)
+    with pytest.raises(ValueError, match="A gif holds at most 5 frames"):
+        main(["record", *NOWHERE, "-o", str(tmp_path / "film.gif"), "--verbose", "0"])
+    assert not list(tmp_path.iterdir()), "no half of a film is left"
+
+
+def test_captions_know_what_was_worst(tmp_path: Path) -> None:
+    captioner = Captioner()
+    frame = np.zeros((101, 201, 3), dtype=np.uint8)
+    first = captioner(frame, Moment(1, 20, 3, 0, (0.0,), (False,), True, 0.5, False, frame))
+    last = captioner(frame, Moment(1, 20, 3, 9, (0.0, -2.0, 5.0), (False, False, True), False, 0.05, True, frame))
+    assert first.shape == last.shape and first.shape[0] % 2 == first.shape[1] % 2 == 0
+    assert (first[:101, :201] == 0).all(), "the frame itself is not touched"
+    dark = [(picture[101:] < 60).all(axis=-1).sum() for picture in (first, last)]
+    assert dark[1] < dark[0], "the bar of the uncertainty is shorter"
