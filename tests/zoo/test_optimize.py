@@ -2,6 +2,7 @@
 
 import logging
 import os
+import shlex
 import shutil
 import subprocess
 import tempfile
@@ -14,47 +15,38 @@ import numpy as np
 import optuna
 import pytest
 import yaml
-from conftest import ENV_ID, TINY
 
+from helpers import ENV_ID, TINY
+from helpers.runs import run_folder
 from sb3_htr import PEARL
 from sb3_htr.pearl.divergence import DivergedError
-from sb3_htr.zoo import optimize, search_space, train
 from sb3_htr.zoo.cli import main
-from sb3_htr.zoo.run.search_space import convert_pearl_params, sample_pearl_params
+from sb3_htr.zoo.commands import optimize, train
+from sb3_htr.zoo.run.method import get_method, merged, methods
+from sb3_htr.zoo.run.search_space import ENCODER_ARCHS, convert_pearl_params, sample_pearl_params
 
 SMALL = ["-params", "n_tasks_per_rollout:4", "n_episodes_per_task:3", "learning_starts:240", "n_envs:4"]
 
 
-def sample_little(trial: optuna.Trial, *_: Any) -> dict[str, Any]:
-    """Makes trials that take a moment."""
-    rate = trial.suggest_float("learning_rate", 1e-4, 1e-3)
-    return {"learning_rate": rate, "gradient_steps": 2, "policy_kwargs": TINY["policy_kwargs"]}
-
-
-@pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(train, "sample_pearl_params", sample_little)
-    monkeypatch.setattr(train, "convert_pearl_params", lambda params: params)
-    monkeypatch.setattr(optimize, "PAUSE", 0.05)
-
-
-def search(folder: Path, storage: str, n_trials: int = 2) -> int:
+def search(folder: Path, storage: str, n_trials: int = 2, method: str | None = None) -> int:
     arguments = ["optimize", "--env", ENV_ID, "-f", str(folder), "-n", "480", "--n-trials", str(n_trials), "--seed", "1"]
+    arguments += ["--method", method] if method else []
     return main([*arguments, "--n-evaluations", "2", "--storage", storage, "--study-name", "test", "--verbose", "0", *SMALL])
 
 
-def check_search(folder: Path, storage: str, capsys: pytest.CaptureFixture[str]) -> optuna.Study:
+def check_search(folder: Path, storage: str, capsys: pytest.CaptureFixture[str], method: str | None = None) -> optuna.Study:
     """Two trials, then a third by another worker, then a training with what trial 0 had."""
-    assert search(folder, storage) == 0
-    assert search(folder, storage, n_trials=1) == 0
+    assert search(folder, storage, method=method) == 0
+    assert search(folder, storage, n_trials=1, method=method) == 0
     study = optimize.create_study(storage, "test")
     assert [trial.number for trial in study.get_trials()] == [0, 1, 2]
     output = capsys.readouterr().out
-    assert f"--study-name test --storage {storage} --trial-id {study.best_trial.number}" in output
-    assert len(list(folder.glob("pearl/report_*.csv"))) >= 1 and not list(folder.glob(f"pearl/{ENV_ID}_*"))
-    arguments = ["train", "--env", ENV_ID, "-f", str(folder), "-n", "240", "--eval-freq", "-1", "--verbose", "0"]
-    assert main([*arguments, "--storage", storage, "--study-name", "test", "--trial-id", "0", *SMALL]) == 0
-    model = PEARL.load(folder / "pearl" / f"{ENV_ID}_1" / f"{ENV_ID}.zip")
+    say = f"sb3-htr train --env {ENV_ID}{f' --method {method}' if method else ''} --study-name test --storage {storage}"
+    assert f"{say} --trial-id {study.best_trial.number}\n" in output
+    assert len(list(folder.glob("*/report_*.csv"))) >= 1 and not list(folder.glob(f"*/{ENV_ID}_*"))
+    arguments = [*shlex.split(say)[1:], "-f", str(folder), "-n", "240", "--eval-freq", "-1", "--verbose", "0"]
+    assert main([*arguments, "--trial-id", "0", *SMALL]) == 0
+    model = PEARL.load(run_folder(folder, method or "htr-ser") / f"{ENV_ID}.zip")
     assert model.learning_rate(1.0) == study.trials[0].params["learning_rate"]  # type: ignore[operator]
     return study
 
@@ -67,7 +59,7 @@ def test_a_study_in_sqlite(quick: None, tmp_path: Path, capsys: pytest.CaptureFi
 
 
 def test_a_study_in_a_journal(quick: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    check_search(tmp_path, f"{tmp_path}/journal/study.log", capsys)
+    check_search(tmp_path, f"{tmp_path}/journal/study.log", capsys, method="htr-ec")
 
 
 def as_postgres(command: list[str]) -> list[str]:
@@ -153,38 +145,44 @@ def test_a_search_that_learnt_nothing_says_so(
     assert len([text for text in said if "existing study" in text]) == 1
 
 
-def test_what_is_sampled_makes_a_model_and_is_what_is_loaded() -> None:
-    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
-    for _ in range(10):
+@pytest.mark.parametrize("name", methods())
+def test_what_is_sampled_makes_a_model_of_the_method_and_is_what_is_loaded(name: str) -> None:
+    study, method = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0)), get_method(name)
+    relabels = method.relabel_probability > 0
+    sampled_probabilities = set()
+    for _ in range(4):
         trial = study.ask()
-        sampled = sample_pearl_params(trial, 2, 1, {"her_kwargs": {"rl_batch_source": "task", "relabel_probability": 0.2}})
-        converted = convert_pearl_params(trial.params)
-        assert sampled["replay_buffer_kwargs"].pop("rl_batch_source") == "task"
-        assert sampled == converted and 0.8 <= converted["gamma"] < 1
-        model = PEARL("MlpPolicy", ENV_ID, **sampled)
+        sampled = sample_pearl_params(trial, relabels)
+        assert sampled == convert_pearl_params(trial.params) and 0.8 <= sampled["gamma"] < 1
+        model = PEARL("MlpPolicy", ENV_ID, **merged(method.hyperparams(), sampled))
         assert model.policy.latent_dim == trial.params["latent_dim"]
-        assert model.policy.encoder_arch == search_space.ENCODER_ARCHS[trial.params["encoder_arch"]]
+        assert model.policy.encoder_arch == ENCODER_ARCHS[trial.params["encoder_arch"]]
+        buffer = model.replay_buffer
+        assert buffer is not None and type(buffer.relabeller).__name__ == method.relabeller
+        sampled_probabilities.add(buffer.relabel_probability)
+    assert len(sampled_probabilities) > 1 if relabels else sampled_probabilities == {0.0}
 
 
-def test_a_trial_joins_the_settings_of_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_trial_joins_the_settings_of_the_file(tmp_path: Path) -> None:
     """rl_zoo3 replaces the dicts of the file, and takes trial 0 for none."""
     storage = f"sqlite:///{tmp_path}/study.db"
     study = optimize.create_study(storage, "test")
     study.enqueue_trial({"learning_rate": 0.002, "relabel_probability": 0.3})
     asked = study.ask()
-    sample_pearl_params(asked, 2, 1, {})
+    sample_pearl_params(asked)
     study.tell(asked, 1.0)
-    settings = {key: value for key, value in TINY.items() if key != "seed"}
-    block = {**settings, "policy": "MlpPolicy", "n_timesteps": 240, "n_envs": 4}
-    block["replay_buffer_kwargs"] = {"rl_batch_source": "task", "relabel_probability": 0.9}
+    block: dict[str, Any] = {key: value for key, value in TINY.items() if key != "seed"}
+    block |= {"policy": "MlpPolicy", "n_timesteps": 240, "n_envs": 4}
+    relabeller = {"name": "SingleEpisodeRelabelling", "rl_batch_source": "task"}
+    block["replay_buffer_kwargs"] = {"relabeller": relabeller, "relabel_probability": 0.9}
     (tmp_path / "my.yml").write_text(yaml.safe_dump({ENV_ID: block}))
     arguments = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(tmp_path / "my.yml"), "--eval-freq", "-1"]
     trial = ["--storage", storage, "--study-name", "test", "--trial-id", "0", "-params", "gradient_steps:2"]
     assert main([*arguments, "--verbose", "0", *trial]) == 0
-    model = PEARL.load(tmp_path / "pearl" / f"{ENV_ID}_1" / f"{ENV_ID}.zip")
+    model = PEARL.load(run_folder(tmp_path) / f"{ENV_ID}.zip")
     strategy = asked.params["hindsight_task_strategy"]
-    expected = {"rl_batch_source": "task", "relabel_probability": 0.3, "hindsight_task_strategy": strategy}
-    assert model.replay_buffer_kwargs == expected
+    expected = {"relabel_probability": 0.3, "rl_reward_type": "sparse"}
+    assert model.replay_buffer_kwargs == {**expected, "relabeller": {**relabeller, "hindsight_task_strategy": strategy}}
     assert model.gradient_steps == 2, "-params wins over the trial"
 
 

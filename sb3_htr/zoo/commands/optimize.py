@@ -76,6 +76,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--env")
     parser.add_argument("--storage")
     parser.add_argument("--study-name")
+    parser.add_argument("--method")
     args, _ = parser.parse_known_args(argv)
     if args.storage and not args.study_name:
         raise ValueError(
@@ -96,8 +97,10 @@ def main(argv: Sequence[str]) -> None:
     if not any(values):
         print(f"No trial learnt anything: the return after adaptation is 0 in all {len(values)}. Make the trials longer (-n).")
     else:
+        method = f" --method {args.method}" if args.method else ""
         where = f"--study-name {args.study_name} --storage {args.storage}"
-        print(f"Train with the best trial so far: sb3-htr train --env {args.env} {where} --trial-id {study.best_trial.number}")
+        trial = f"{where} --trial-id {study.best_trial.number}"
+        print(f"Train with the best trial so far: sb3-htr train --env {args.env}{method} {trial}")
 
 
 def _is_news(record: logging.LogRecord) -> bool:

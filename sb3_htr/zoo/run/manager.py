@@ -203,7 +203,8 @@ class MetaExperimentManager(ExperimentManager):
         :raises optuna.TrialPruned: for hyperparameters that promise little or diverge
         """
         try:
-            HYPERPARAMS_SAMPLER[self.algo] = lambda trial, *_: merged(self._hyperparams, sample_pearl_params(trial))
+            relabels = self.method.relabel_probability > 0
+            HYPERPARAMS_SAMPLER[self.algo] = lambda trial, *_: merged(self._hyperparams, sample_pearl_params(trial, relabels))
             return super().objective(trial)
         except DivergedError as error:
             print(f"Trial {trial.number} is pruned: {error}")

@@ -15,9 +15,10 @@ STRATEGIES = [strategy.value for strategy in HindsightTaskStrategy]
 ENCODER_ARCHS = {"small": [64, 64], "medium": [128, 128], "paper": [200, 200, 200]}
 
 
-def sample_pearl_params(trial: "optuna.Trial") -> dict[str, Any]:
+def sample_pearl_params(trial: "optuna.Trial", relabels: bool = True) -> dict[str, Any]:
     """
     :param trial: draws the values
+    :param relabels: whether the method relabels; how often and how it does is sampled then
     :return: arguments of PEARL
     """
     params: dict[str, Any] = {
@@ -33,9 +34,10 @@ def sample_pearl_params(trial: "optuna.Trial") -> dict[str, Any]:
         "latent_dim": trial.suggest_int("latent_dim", 2, 8),
         "net_arch": trial.suggest_categorical("net_arch", list(NET_ARCHS)),
         "encoder_arch": trial.suggest_categorical("encoder_arch", list(ENCODER_ARCHS)),
-        "relabel_probability": trial.suggest_categorical("relabel_probability", RELABEL_PROBABILITIES),
-        "hindsight_task_strategy": trial.suggest_categorical("hindsight_task_strategy", STRATEGIES),
     }
+    if relabels:
+        params["relabel_probability"] = trial.suggest_categorical("relabel_probability", RELABEL_PROBABILITIES)
+        params["hindsight_task_strategy"] = trial.suggest_categorical("hindsight_task_strategy", STRATEGIES)
     return convert_pearl_params(params)
 
 
@@ -53,8 +55,9 @@ def convert_pearl_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
         "net_arch": NET_ARCHS[params.pop("net_arch")],
         "encoder_arch": ENCODER_ARCHS[params.pop("encoder_arch")],
     }
-    converted["replay_buffer_kwargs"] = {
-        "relabel_probability": params.pop("relabel_probability"),
-        "relabeller": {"hindsight_task_strategy": params.pop("hindsight_task_strategy")},
-    }
+    if "relabel_probability" in params:
+        converted["replay_buffer_kwargs"] = {
+            "relabel_probability": params.pop("relabel_probability"),
+            "relabeller": {"hindsight_task_strategy": params.pop("hindsight_task_strategy")},
+        }
     return {**converted, **params}
