@@ -1,4 +1,4 @@
-"""Nothing is lost: killed, interrupted and damaged runs."""
+"""Nothing is lost: killed and interrupted runs go on as if nothing had happened."""
 
 import json
 import os
@@ -8,19 +8,20 @@ import signal
 import subprocess
 import sys
 import time
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch as th
-from conftest import ENV_ID
 from stable_baselines3.common.monitor import load_results
 
+from helpers import ENV_ID
+from helpers import parameters as model_parameters
+from helpers.runs import run_folder
 from sb3_htr import PEARL
-from sb3_htr.common.checkpoint import MANIFEST, STATE, DamagedCheckpoint, read_checkpoint, write_checkpoint
-from sb3_htr.common.resume import checkpoints, load_latest
+from sb3_htr.common.checkpoint import write_checkpoint
+from sb3_htr.common.resume import checkpoints
 from sb3_htr.zoo.cli import main
 
 # Rollouts of 4 tasks x 3 episodes x 20 steps, 10 of them, a checkpoint after each
@@ -34,7 +35,7 @@ TRAIN = [*ARGUMENTS, "--verbose", "0", "--env-kwargs", "goal_distance:0.4", "-pa
 
 def parameters(run: Path) -> dict[str, th.Tensor]:
     model = PEARL.load(run / f"{ENV_ID}.zip", device="cpu")
-    tensors = {f"policy.{name}": value for name, value in model.policy.state_dict().items()}
+    tensors = model_parameters(model)
     for name in ("actor.optimizer", "critic.optimizer", "encoder.optimizer"):
         for i, state in model.get_parameters()[name]["state"].items():
             tensors |= {f"{name}.{i}.{key}": value for key, value in state.items()}
@@ -65,12 +66,12 @@ def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that nothing happened to."""
     folder = tmp_path_factory.mktemp("unbroken")
     assert main([*TRAIN, "-f", str(folder)]) == 0
-    return folder / "pearl" / f"{ENV_ID}_1"
+    return run_folder(folder)
 
 
 def cut_off(run: Path, folder: Path, steps: int) -> Path:
     """A copy of a run as if it had been killed some time after its checkpoint of ``steps``."""
-    copy = folder / "cut" / "pearl" / f"{ENV_ID}_1"
+    copy = run_folder(folder / "cut")
     shutil.copytree(run, copy)
     (copy / f"{ENV_ID}.zip").unlink()
     return copy
@@ -92,14 +93,15 @@ def test_a_run_goes_on_exactly(unbroken: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "settings",
     [
-        ["replay_buffer_class:'EpisodeClustering'"],
-        ["normalize:{'norm_obs':True,'norm_reward':False}", "ent_coef:'auto'", "learning_rate:'lin_1e-3'"],
+        ["replay_buffer_kwargs:{'relabeller':'EpisodeClustering'}"],
+        [NETS[-1].replace("}", ",'normalize_observations':True}"), "ent_coef:'auto'", "learning_rate:'lin_1e-3'"],
+        ["train_explorer:'search'", "explorer:{'name':'prior','n_exploration_episodes':1}"],
         ["env_wrapper:'gymnasium.wrappers.OrderEnforcing'"],  # single envs instead of a batch
     ],
 )
 def test_runs_of_all_kinds_go_on_exactly(settings: list[str], tmp_path: Path) -> None:
     assert main([*TRAIN, *settings, "-f", str(tmp_path)]) == 0
-    run = tmp_path / "pearl" / f"{ENV_ID}_1"
+    run = run_folder(tmp_path)
     copy = cut_off(run, tmp_path, STEPS)
     assert main(["train", "--resume", str(copy)]) == 0
     assert_same_run(copy, run)
@@ -117,7 +119,7 @@ def test_tensorboard_shows_each_point_once(tmp_path: Path) -> None:
     assert main([*TRAIN, "-f", str(tmp_path), "-tb", str(tmp_path / "tb")]) == 0
     names = ["train/critic_loss", "rollout/ep_rew_mean", "eval/mean_reward"]
     before = [points(name) for name in names]
-    assert main(["train", "--resume", str(tmp_path / "pearl" / f"{ENV_ID}_1")]) == 0
+    assert main(["train", "--resume", str(run_folder(tmp_path))]) == 0
     assert [points(name) for name in names] == before
 
 
@@ -135,13 +137,13 @@ def test_kills_at_random_moments_change_nothing(unbroken: Path, tmp_path: Path) 
     n_kills = 20
     moments = random.Random(n_kills)
     command = [sys.executable, "-m", "sb3_htr.zoo.cli"]
-    run = tmp_path / "pearl" / f"{ENV_ID}_1"
+    run = run_folder(tmp_path)
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     kills = 0
     while kills < n_kills:
         again = bool(checkpoints(run))
         if not again:
-            shutil.rmtree(tmp_path / "pearl", ignore_errors=True)
+            shutil.rmtree(run.parent, ignore_errors=True)
         arguments = ["train", "--resume", str(run)] if again else [*TRAIN, "-f", str(tmp_path)]
         process = subprocess.Popen(
             [*command, *arguments], env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
@@ -156,7 +158,7 @@ def test_kills_at_random_moments_change_nothing(unbroken: Path, tmp_path: Path) 
             kills += 1
         else:  # it was faster, and is done
             assert_same_run(run, unbroken)
-            shutil.rmtree(tmp_path / "pearl")
+            shutil.rmtree(run.parent)
     (run / "checkpoints" / ".240_steps.1.tmp").mkdir()  # as a kill while writing leaves it
     subprocess.run([*command, "train", "--resume", str(run)], env=environment, check=True, capture_output=True)
     assert_same_run(run, unbroken)
@@ -166,7 +168,7 @@ def test_kills_at_random_moments_change_nothing(unbroken: Path, tmp_path: Path) 
 def test_an_interrupt_stops_with_a_checkpoint_and_says_how_to_go_on(unbroken: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-u", "-m", "sb3_htr.zoo.cli", *TRAIN, "-f", str(tmp_path)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    run = tmp_path / "pearl" / f"{ENV_ID}_1"
+    run = run_folder(tmp_path)
     while process.poll() is None and not checkpoints(run):
         time.sleep(0.005)
     process.send_signal(signal.SIGINT)
@@ -176,80 +178,6 @@ def test_an_interrupt_stops_with_a_checkpoint_and_says_how_to_go_on(unbroken: Pa
     assert "Press Ctrl-C again" in output
     assert main(["train", "--resume", str(run)]) == 0
     assert_same_run(run, unbroken)
-
-
-# --- damage
-
-
-def damage_truncate(folder: Path) -> None:
-    data = (folder / STATE).read_bytes()
-    (folder / STATE).write_bytes(data[: len(data) // 2])
-
-
-def damage_flip_a_bit(folder: Path) -> None:
-    data = bytearray((folder / STATE).read_bytes())
-    data[len(data) // 3] ^= 1
-    (folder / STATE).write_bytes(bytes(data))
-
-
-def damage_empty(folder: Path) -> None:
-    (folder / STATE).write_bytes(b"")
-
-
-def damage_remove_state(folder: Path) -> None:
-    (folder / STATE).unlink()
-
-
-def damage_remove_manifest(folder: Path) -> None:
-    (folder / MANIFEST).unlink()
-
-
-def damage_garble_manifest(folder: Path) -> None:
-    (folder / MANIFEST).write_text("{")
-
-
-def damage_foreign_version(folder: Path) -> None:
-    manifest = json.loads((folder / MANIFEST).read_text())
-    (folder / MANIFEST).write_text(json.dumps({**manifest, "format": 999}))
-
-
-DAMAGES = [value for name, value in globals().items() if name.startswith("damage_")]
-
-
-@pytest.mark.parametrize("damage", DAMAGES)
-def test_a_damaged_checkpoint_gives_one_sentence_and_the_next_older_one_is_taken(
-    damage: Any, unbroken: Path, tmp_path: Path
-) -> None:
-    run = cut_off(unbroken, tmp_path, STEPS)
-    newest, older = checkpoints(run)
-    damage(newest)
-    with pytest.raises(DamagedCheckpoint) as error:
-        read_checkpoint(newest)
-    assert str(newest) in str(error.value) and len(str(error.value).split(". ")) == 1
-    with pytest.warns(UserWarning, match="next older checkpoint"):
-        assert load_latest(run)[0] == older
-    damage(older)
-    with warnings.catch_warnings(), pytest.raises(FileNotFoundError, match="no checkpoint to go on from"):
-        warnings.simplefilter("ignore")
-        load_latest(run)
-
-
-class Bomb:
-    """A pickle that runs code."""
-
-    def __init__(self, file: Path) -> None:
-        self.file = file
-
-    def __reduce__(self) -> Any:
-        return Path.touch, (self.file,)
-
-
-def test_reading_a_checkpoint_runs_no_code(tmp_path: Path) -> None:
-    fuse = tmp_path / "exploded"
-    write_checkpoint(tmp_path / "1_steps", {"bomb": Bomb(fuse)})
-    with pytest.raises(Exception, match=r"(?i)weights.only"):
-        read_checkpoint(tmp_path / "1_steps")
-    assert not fuse.exists()
 
 
 def test_a_full_disk_stops_no_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -268,7 +196,7 @@ def test_a_full_disk_stops_no_training(tmp_path: Path, monkeypatch: pytest.Monke
         assert main([*TRAIN, "-f", str(tmp_path)]) == 0
     steps = [int(folder.name.split("_")[0]) for folder in calls]
     assert np.diff(steps).tolist() == [240] * (len(steps) - 1), "the next rollout tries again"
-    assert len(checkpoints(tmp_path / "pearl" / f"{ENV_ID}_1")) == 2
+    assert len(checkpoints(run_folder(tmp_path))) == 2
 
 
 def test_changed_settings_and_extra_arguments_are_refused(unbroken: Path, tmp_path: Path) -> None:
