@@ -118,14 +118,14 @@ def write(name: str, command: str, experiment: Experiment, results: dict[Cell, P
     experiment.figure(results, folder / f"{name}.png")
 
 
-def run(name: str, experiment: Experiment, cells: list[Cell], runs: Path, output: Path, jobs: int) -> None:
+def run(name: str, command: str, experiment: Experiment, cells: list[Cell], runs: Path, output: Path, jobs: int) -> None:
     """
     :param name: of the experiment
+    :param command: that repeats it
     :param experiment: what is run
     :param cells: its runs
     :param runs: folder for them
     :param output: folder for the results
     :param jobs: runs at a time
     """
-    n_seeds = len({cell.seed for cell in cells})
-    write(name, f"sb3-htr experiment {name} --seeds {n_seeds}", experiment, run_cells(cells, runs, jobs), output)
+    write(name, command, experiment, run_cells(cells, runs, jobs), output)

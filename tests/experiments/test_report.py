@@ -1,40 +1,19 @@
 """From raw results to tables and pictures. The runs are made up; what is said of them must be true."""
 
 import json
-import subprocess
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import tables
 
-from sb3_htr.experiments import (
-    goal_distance,
-    locomotion,
-    point_robot,
-    precision,
-    relabelling,
-    report,
-    tables,
-    target_speed,
-)
-from sb3_htr.experiments.report import Plot, episodes_to_first_success, loss_of_stability
-from sb3_htr.experiments.runner import LOGGED, Cell, run_cell
-from sb3_htr.common.resume import checkpoints
-from sb3_htr.zoo import intervals
+from sb3_htr.experiments import figures, report
+from sb3_htr.experiments.grid import EXPERIMENTS
+from sb3_htr.experiments.report import episodes_to_first_success, loss_of_stability
+from sb3_htr.experiments.runner import LOGGED, Cell
 from sb3_htr.zoo.plots.intervals import iqm_difference, iqm_interval
-
-EXPERIMENTS: dict[str, tuple[Callable[[int, int], list[Cell]], Plot]] = {
-    "point_robot": (point_robot.cells, report.plot_learning),
-    "relabelling": (relabelling.cells, relabelling.plot),
-    "goal_distance": (goal_distance.cells, goal_distance.plot),
-    "target_speed": (target_speed.cells, report.plot_learning),
-    "precision": (precision.cells, report.plot_learning),
-    "wheeled": (partial(locomotion.cells, "SparseWheeled-v0"), report.plot_learning),
-    "ant": (partial(locomotion.cells, "SparseAnt-v0"), report.plot_learning),
-}
+from sb3_htr.zoo.run.method import methods
 
 
 def made_up(cells: list[Cell], folder: Path) -> dict[Cell, Path]:
@@ -58,46 +37,46 @@ def made_up(cells: list[Cell], folder: Path) -> dict[Cell, Path]:
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    cells, plot = EXPERIMENTS[name]
-    monkeypatch.setattr(report, "RESULTS", tmp_path / "results")
-    monkeypatch.setattr(intervals, "REPS", 50)
-    folder = report.write(name, made_up(cells(3, 20_000), tmp_path), plot)
+    experiment, folder = EXPERIMENTS[name], tmp_path / "results"
+    cells = experiment.cells(3)
+    monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 50)
+    report.write(name, f"sb3-htr experiment {name}", experiment, made_up(cells, tmp_path), folder)
     assert (folder / f"{name}.png").stat().st_size > 10_000
-    assert len(np.load(folder / "raw.npz").files) > 10
+    raw = np.load(folder / "raw.npz")
+    assert {key.split("/")[0] for key in raw.files} == {cell.name for cell in cells}
+    assert all((raw[f"{cell.name}/returns_{cell.explorers[0]}"] == cell.seed).all() for cell in cells)
     summary = json.loads((folder / "summary.json").read_text())
     value = {"last_episode_return": 2.0, "success_rate": 1.0, "episodes_to_first_success": 3.0, "loss_of_stability": 1.0}
+    variants = {(cell.variant, str(cell.env_kwargs)): cell for cell in cells}
     for row in summary["rows"]:
+        cell = variants[row["variant"], str(row["env_kwargs"])]
         assert row["iqm"] == value[row["metric"]] and row["n_seeds"] == 3
-        assert row["low"] <= row["iqm"] <= row["high"]
+        assert (row["method"], row["settings"], row["env_steps"]) == (cell.method, cell.settings, cell.n_timesteps)
+        assert row["low"] <= row["iqm"] <= row["high"] and row["method"] in methods()
+    assert len(summary["rows"]) == len(variants) * len(experiment.explorers) * len(value)
     assert all(difference["low"] <= 0 <= difference["high"] for difference in summary["differences"])
+    assert {difference["of"] for difference in summary["differences"]} == {experiment.variants[0].name or "htr-ser"}
     table = tables.table(summary)
-    assert table.count("| 1.00 [1.00, 1.00] | 3.00 [3.00, 3.00] |") == len({cell.method for cell in cells(1, 1)}) * (
-        len({str(cell.env_kwargs) for cell in cells(1, 1)})
-    ) + sum(len(cell.explorers) - 1 for cell in cells(1, 1))
-    line = f"{cells(1, 1)[0].env_id} | 20,000 | 3 | 2.0 [1."
-    assert (line in tables.headline({name: summary})) == (name in tables.ENVS)
+    assert table.count("| 1.00 [1.00, 1.00] | 3.00 [3.00, 3.00] |") == len(variants) * len(experiment.explorers)
+    assert f"`sb3-htr experiment {name}`, commit abc" in table
+    headline = tables.headline({name: summary})
+    shown = [cell for cell in variants.values() if cell.variant in tables.METHODS] if name in tables.ENVS else []
+    assert headline.count("| 2.0 [1.") == len(shown) * len(experiment.explorers)
+    assert all(f"| {cell.n_timesteps:,} | 3 | {cell.variant} | `prior` | 2.0 [1." in headline for cell in shown)
 
 
-def test_a_killed_run_of_an_experiment_goes_on(tmp_path: Path) -> None:
-    small: dict[str, Any] = {"n_envs": 4, "n_tasks_per_rollout": 4, "n_episodes_per_task": 3, "learning_starts": 240}
-    small |= {
-        "gradient_steps": 2,
-        "meta_batch_size": 4,
-        "batch_size": 4,
-        "policy_kwargs": {"net_arch": [8], "encoder_arch": [8]},
-    }
-    cell = Cell("SparseWheeled-v0", "tiny", 1, 4 * 200 * 6, hyperparams=small, explorers=("search",))
-    command = cell.command(tmp_path / cell.name, 2400)
-    killed = subprocess.run([*command, "--save-freq", "1"], check=True, capture_output=True)
-    assert killed.returncode == 0
-    run = next((tmp_path / cell.name).glob("*/*"))
-    (run / f"{cell.env_id}.zip").unlink()
-    steps = checkpoints(run)[0].name
-    result = run_cell(cell, tmp_path, 2400)
-    assert f"Going on from {run / 'checkpoints' / steps}" in (tmp_path / cell.name / "log.txt").read_text()
-    raw = np.load(result)
-    assert raw["returns_search"].shape == (20, 20) and raw["timesteps"].tolist() == [2400, 4800]
-    assert len(list((tmp_path / cell.name).glob("*/*"))) == 1
+@pytest.mark.parametrize("experiment", EXPERIMENTS.values(), ids=EXPERIMENTS)
+def test_the_grid_is_what_it_says(experiment: Any) -> None:
+    cells = experiment.cells()
+    assert len(cells) == experiment.seeds * len(experiment.variants)
+    assert {cell.seed for cell in cells} == set(range(1, experiment.seeds + 1))
+    for cell, variant in zip(cells, experiment.variants * experiment.seeds, strict=True):
+        assert (cell.env_id, cell.method, cell.settings) == (experiment.env_id, variant.method, variant.settings)
+        assert cell.n_timesteps == experiment.n_timesteps * variant.budget
+    few = experiment.cells(1, 0.1)
+    assert len(few) == len(experiment.variants)
+    assert [10 * cell.n_timesteps for cell in few] == [cell.n_timesteps for cell in cells[: len(few)]]
+    assert [10 * cell.eval_freq for cell in few] == [cell.eval_freq for cell in cells[: len(few)]]
 
 
 def test_statistics() -> None:
@@ -110,5 +89,13 @@ def test_statistics() -> None:
 
 
 def test_optimal_return_is_that_of_the_env() -> None:
-    assert goal_distance.optimal_return(1.0, 20) == pytest.approx(13.38, abs=0.05)
-    assert goal_distance.optimal_return(2.0, 40) > goal_distance.optimal_return(2.0, 30)
+    assert figures.optimal_return(1.0, 20) == pytest.approx(13.38, abs=0.05)
+    assert figures.optimal_return(2.0, 40) > figures.optimal_return(2.0, 30)
+
+
+def test_tables_are_filled_in_between_their_marks_alone(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("before\n<!-- one -->\nold\n<!-- end -->\nbetween\n<!-- two -->\n<!-- end -->\n")
+    for _ in range(2):
+        tables.fill([page], {"one": "new\n", "two": "2\n", "three": "3\n"})
+        assert page.read_text() == ("before\n<!-- one -->\nnew\n<!-- end -->\nbetween\n<!-- two -->\n2\n<!-- end -->\n")

@@ -29,5 +29,6 @@ def main(argv: Sequence[str]) -> None:
     cells = experiment.cells(1, 0.1) if args.quick else experiment.cells(args.seeds)
     quick = "quick-" if args.quick else ""
     runs, output = args.runs or Path("runs", quick + args.name), args.output or Path("results", quick + args.name)
-    report.run(args.name, experiment, cells, runs, output, args.jobs)
+    how = "--quick" if args.quick else f"--seeds {len({cell.seed for cell in cells})}"
+    report.run(args.name, f"sb3-htr experiment {args.name} {how}", experiment, cells, runs, output, args.jobs)
     print(f"Results: {output}")
