@@ -9,7 +9,6 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from htr_envs.dynamics import Dynamics, DynamicsEnv, DynamicsVectorEnv
-from htr_envs.rendering import BLUE, ORANGE, PALE_ORANGE, Canvas
 from htr_envs.semicircle_goals import SemicircleGoalFamily
 from htr_envs.task_env import BoolArray, FloatArray
 
@@ -56,16 +55,19 @@ class PointRobotDynamics(Dynamics[PointRobotFamily]):
 
         :return: picture (400, 400, 3), uint8.
         """
+        # imported here: who never renders needs no Pillow
+        from htr_envs.rendering import BLUE, ORANGE, PALE_ORANGE, Canvas
+
         distance, radius = task_family.goal_distance, task_family.goal_radius
         # 20 steps lead at most 2 along each axis: a robot of that episode length never leaves the picture
         canvas = Canvas(max(2.2, 1.1 * distance + radius))
         canvas.circle((0.0, 0.0), distance, 3, PALE_ORANGE, upper_half=True)
         canvas.axes()
         reached = bool(np.hypot(*(path[-1] - task)) < radius)
-        canvas.disc(task, radius, ORANGE, 1.0 if reached else 0.5)
+        canvas.disc(task, radius, ORANGE if reached else PALE_ORANGE)
         canvas.circle(task, radius, 2, ORANGE)
         canvas.path(path)
-        canvas.legend([("GOAL", ORANGE), ("START", None), ("ROBOT", BLUE)])
+        canvas.legend([("hidden goal", ORANGE), ("start", None), ("robot", BLUE)])
         return canvas.image()
 
 

@@ -9,7 +9,6 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from htr_envs.dynamics import Dynamics, DynamicsEnv, DynamicsVectorEnv
-from htr_envs.rendering import BLUE, ORANGE, PALE_ORANGE, Canvas
 from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, at_step, check_reward_type, split_evenly
 
 FRICTION = np.float32(0.95)
@@ -144,13 +143,15 @@ class TargetSpeedDynamics(Dynamics[TargetSpeedFamily]):
 
         :return: picture (400, 400, 3), uint8.
         """
+        from htr_envs.rendering import BLUE, ORANGE, PALE_ORANGE, Canvas  # who never renders needs no Pillow
+
         (speed,), tolerance = task.tolist(), task_family.tolerance
         canvas = Canvas(4.2)
         held = bool(abs(np.hypot(*path[-1]) - speed) < tolerance)
         canvas.circle((0.0, 0.0), speed, 2 * tolerance / canvas.pixel, ORANGE if held else PALE_ORANGE)
         canvas.axes()
         canvas.path(path)
-        canvas.legend([("TARGET SPEED", ORANGE), ("START", None), ("SLEDGE", BLUE)])
+        canvas.legend([("hidden target speed", ORANGE), ("start", None), ("sledge", BLUE)])
         return canvas.image()
 
 
