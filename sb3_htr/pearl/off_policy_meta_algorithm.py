@@ -229,16 +229,8 @@ class OffPolicyMetaAlgorithm(SAC):
         Adapt to ``n_tasks_per_rollout`` training tasks, one per env at a time, and store all that happens.
 
         Each env stays on its task until every env has finished ``n_episodes_per_task`` episodes; envs whose episodes are
-        shorter go on with more of them.
-
-        :param env: training env
-        :param callback: called at every step
-        :param train_freq: not used, a rollout is whole adaptations
-        :param replay_buffer: where the steps go
-        :param action_noise: not used
-        :param learning_starts: env steps with random actions
-        :param log_interval: rollouts between two logs
-        :return: what was collected
+        shorter go on with more of them. ``train_freq`` and ``action_noise`` are not used: a rollout is whole adaptations, and
+        z explores.
         """
         assert self.task_bank is not None
         self.policy.set_training_mode(False)

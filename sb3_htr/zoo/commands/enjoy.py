@@ -90,9 +90,7 @@ def can_be_drawn(agent: TrainedAgent) -> bool:
 
 
 def main(argv: Sequence[str]) -> None:
-    """
-    :param argv: arguments of the command
-    """
+    """The command, with its arguments."""
     parser = make_parser("enjoy", "Watch a trained agent adapt to tasks that it has not seen, one after the other.", EXAMPLE)
     add_agent_arguments(parser)
     add_task_arguments(parser)

@@ -33,9 +33,7 @@ def table(record: AdaptationRecord) -> str:
 
 
 def main(argv: Sequence[str]) -> None:
-    """
-    :param argv: arguments of the command
-    """
+    """The command, with its arguments."""
     parser = make_parser("evaluate", "Adapt a trained agent to unseen tasks: a table, pictures and the data.", EXAMPLE)
     add_agent_arguments(parser)
     add_adaptation_arguments(parser, n_episodes=20)

@@ -85,9 +85,7 @@ def push_to_hub(folder: Path, repo_id: str, private: bool = False) -> str:
 
 
 def main(argv: Sequence[str]) -> None:
-    """
-    :param argv: arguments of the command
-    """
+    """The command, with its arguments."""
     description = "Write an agent as a small model file with a model card: scores after adaptation, how to load it."
     parser = make_parser("export", description, EXAMPLE)
     add_agent_arguments(parser)

@@ -138,9 +138,7 @@ def learning_curve(label: str, agents: Sequence[TrainedAgent]) -> Curve | None:
 
 
 def main(argv: Sequence[str]) -> None:
-    """
-    :param argv: arguments of the command
-    """
+    """The command, with its arguments."""
     description = "Pictures of one or several runs: learning curves, return per adaptation episode, paths, latent space."
     parser = make_parser("plot", description, EXAMPLE)
     add_agent_arguments(parser, several=True)

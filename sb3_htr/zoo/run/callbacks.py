@@ -2,8 +2,9 @@
 
 import os
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
+import optuna
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import CSVOutputFormat
 
@@ -51,18 +52,6 @@ class ProgressCallback(BaseCallback):
             self._output.close()
 
 
-class TrialResult(Protocol):
-    """The part of an Optuna trial that :class:`MetaTrialEvalCallback` uses."""
-
-    def report(self, value: float, step: int) -> None:
-        """Report an intermediate value."""
-        ...
-
-    def should_prune(self) -> bool:
-        """Whether the trial is hopeless."""
-        ...
-
-
 class MetaTrialEvalCallback(MetaEvalCallback):
     """
     :class:`MetaEvalCallback` for a trial of a hyperparameter search; has the attributes of rl_zoo3's ``TrialEvalCallback``.
@@ -72,7 +61,7 @@ class MetaTrialEvalCallback(MetaEvalCallback):
     :param kwargs: as for :class:`MetaEvalCallback`
     """
 
-    def __init__(self, eval_env: Any, trial: TrialResult, **kwargs: Any) -> None:
+    def __init__(self, eval_env: Any, trial: optuna.Trial, **kwargs: Any) -> None:
         super().__init__(eval_env, **{"verbose": 0, **kwargs})
         self.trial = trial
         self.eval_idx = 0
