@@ -2,7 +2,6 @@
 
 import importlib
 import json
-import os
 import signal
 import sys
 import threading
@@ -18,27 +17,27 @@ from pprint import pprint
 from types import ModuleType
 from typing import Any
 
-import gymnasium as gym
 import optuna
 import rl_zoo3.train
 from rl_zoo3 import exp_manager
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
-from rl_zoo3.utils import ALGOS, SimpleLinearSchedule, get_latest_run_id
+from rl_zoo3.utils import ALGOS, SimpleLinearSchedule
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import LinearSchedule
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr import PEARL
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
-from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.atomic import WRITE_ERRORS, atomic_path, reason
 from sb3_htr.common.checks import check_keywords, check_numbers
 from sb3_htr.common.resume import CheckpointCallback, checkpoints, cut_monitor_files, load_latest
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback, ProgressCallback
+from sb3_htr.zoo.run.folder import claim, lock
 from sb3_htr.zoo.run.method import DEFAULT, get_method, merged
 from sb3_htr.zoo.run.search_space import convert_pearl_params, sample_pearl_params
 from sb3_htr.zoo.run.yaml_values import without_code
@@ -123,19 +122,18 @@ class MetaExperimentManager(ExperimentManager):
         :param n_envs: number of envs
         :param eval_env: whether the envs are for evaluation
         :param no_log: write no monitor file
-        :return: the envs, batched if the registration offers that and no wrapper of single envs is asked for
+        :return: the envs
         """
-        spec = gym.spec(self.env_name.gym_id)
         # A search makes envs for a look at their spaces too, which is no run to be logged
-        no_log = no_log or self.optimize_hyperparameters
-        if spec.vector_entry_point is None or self.env_wrapper is not None or self.args.vec_env == "subproc":
-            return super().create_envs(n_envs, eval_env, no_log)
+        no_log = no_log or self.optimize_hyperparameters or eval_env
         env = make_task_vec_env(
             self.env_name.gym_id,
             N_EVAL_ENVS if eval_env else n_envs,
             seed=self.seed,
-            monitor_dir=None if eval_env or no_log else self.save_path,
+            monitor_dir=None if no_log else self.save_path,
             env_kwargs=self.eval_env_kwargs if eval_env else self.env_kwargs,
+            wrapper=self.env_wrapper,
+            vec_env_class=SubprocVecEnv if self.args.vec_env == "subproc" else None,
         )
         return env if self.vec_env_wrapper is None else self.vec_env_wrapper(env)
 
@@ -147,10 +145,13 @@ class MetaExperimentManager(ExperimentManager):
         if self.tensorboard_log:
             importlib.import_module("tensorboard")  # missing, it should be said before anything is written
         if self.resumed is None:
-            number = get_latest_run_id(self.log_path, self.env_name) + 1
-            self.save_path = os.path.join(self.log_path, f"{self.env_name}_{number}{self._unique}")
+            # An env that cannot be trained on should say so before there is a folder
+            make_task_vec_env(self.env_name.gym_id, env_kwargs=self.env_kwargs, wrapper=self.env_wrapper).close()
+            self.save_path = str(claim(self.log_path, self.env_name, self._unique))
+            self._lock = lock(Path(self.save_path))
         else:
             self.save_path = str(self.resumed)
+            self._lock = lock(self.resumed)
             folder, self._checkpoint = load_latest(self.resumed)
             cut_monitor_files(self.resumed, folder, self._checkpoint["monitor_files"])
             print(f"Going on from {folder}")
@@ -193,6 +194,20 @@ class MetaExperimentManager(ExperimentManager):
                     print(f"To go on: sb3-htr train --resume {self.save_path}")
                 assert model.env is not None
                 model.env.close()
+                self._lock.release()
+
+    def save_trained_model(self, model: BaseAlgorithm) -> None:
+        """
+        :param model: at the end of its training
+        :raises OSError: if it cannot be written
+        """
+        try:
+            super().save_trained_model(model)
+        except WRITE_ERRORS as error:
+            raise OSError(
+                f"The last model could not be written to {self.save_path} ({reason(error)}): free some space, and "
+                f"`sb3-htr train --resume {self.save_path}` goes on from the last checkpoint."
+            ) from error
 
     def objective(self, trial: optuna.Trial) -> float:
         """
