@@ -131,8 +131,7 @@ class OffPolicyMetaAlgorithm(SAC):
         self._introduce_policy()
 
     def _setup_replay(self, env: VecEnv) -> None:
-        checks.check_is_not_normalized(env)
-        checks.check_reward_is_sparse(env)
+        checks.check_rewards(env)
         family = checks.get_task_family(env)
         buffer_class = cast(type[MultiTaskReplayBuffer], self.replay_buffer_class)
         self.replay_buffer = buffer_class(
@@ -157,11 +156,16 @@ class OffPolicyMetaAlgorithm(SAC):
         """
         :param env: env of the same spaces and number of copies; its task family replaces the old one if nothing was collected
         :param force_reset: reset before training goes on
+        :raises ValueError: if there is experience of another task family, or something changes the env's rewards
         """
-        super().set_env(env, force_reset)
-        assert self.env is not None
-        if self.replay_buffer is None:
-            self._setup_replay(self.env)
+        vec_env = self._wrap_env(env)
+        checks.check_rewards(vec_env)
+        if self.replay_buffer is not None and self.replay_buffer.size() > 0:
+            known = checks.family_facts(self.replay_buffer.task_family)
+            checks.check_same_family(known, checks.family_facts(checks.get_task_family(vec_env)), "The env")
+        super().set_env(vec_env, force_reset)
+        if self.replay_buffer is None or self.replay_buffer.size() == 0:
+            self._setup_replay(vec_env)
             self._introduce_policy()
 
     def set_random_seed(self, seed: int | None = None) -> None:
@@ -241,8 +245,8 @@ class OffPolicyMetaAlgorithm(SAC):
             for _ in range(-(-self.n_tasks_per_rollout // env.num_envs))
         )
         if continue_training:
-            if self._n_rollouts == 0:
-                replay_buffer.check_reward_hook()
+            # In each rollout: a sparse reward can go unseen for many, and the env may be another one than before
+            replay_buffer.check_reward_hook(self.task_bank.new)
             self.task_bank.update()
             self.logger.record("rollout/train_tasks_reached", len(self.task_bank.solved))
             callback.on_rollout_end()
