@@ -39,6 +39,14 @@ def checkpoints(run: Path) -> list[Path]:
     return sorted(folders, key=lambda path: int(path.name.split("_")[0]), reverse=True)
 
 
+def n_steps_done(run: Path) -> int:
+    """
+    :param run: folder of a run
+    :return: env steps before its latest checkpoint, 0 without one
+    """
+    return max((int(path.name.split("_")[0]) for path in checkpoints(run)), default=0)
+
+
 def load_latest(run: Path, device: str = "cpu") -> tuple[Path, dict[str, Any]]:
     """
     :param run: folder of a run
@@ -76,7 +84,7 @@ def cut_monitor_files(run: Path, folder: Path, sizes: dict[str, int]) -> None:
 
 class CheckpointCallback(BaseCallback):
     """
-    Saves all that a training is, between rollouts, as ``<save_path>/checkpoints/<steps>_steps/``.
+    Saves all that a training is, between rollouts and at its end, as ``<save_path>/checkpoints/<steps>_steps/``.
 
     A disk that is full, or an old checkpoint that cannot be removed, stops no training: what failed is tried again before the
     next rollout.
@@ -149,8 +157,10 @@ class CheckpointCallback(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         # A rollout begins with a reset of all envs, so nothing is lost by stopping just before it
-        if self.n_calls - self._last_calls < self.save_freq and not self.stopping:
-            return
+        if self.n_calls - self._last_calls >= self.save_freq or self.stopping:
+            self._save()
+
+    def _save(self) -> None:
         folder = self.run / "checkpoints" / f"{self.num_timesteps}_steps"
         self._stopped = self.stopping
         try:
@@ -168,6 +178,9 @@ class CheckpointCallback(BaseCallback):
         self._remove_old()
 
     def _on_training_end(self) -> None:
+        # Not in the middle of a rollout, where a callback may have stopped
+        if not self._stopped and self.num_timesteps >= self.model._total_timesteps and self.n_calls > self._last_calls:
+            self._save()
         # A process killed between writing its last checkpoint and cleaning up leaves that to the one that goes on
         self._remove_old()
 

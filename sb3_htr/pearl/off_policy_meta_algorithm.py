@@ -5,7 +5,7 @@ import pathlib
 import pickle
 import warnings
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import IO, Any, TypeVar, cast
 
@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, TrainFreq
 from stable_baselines3.common.utils import check_for_correct_spaces
@@ -29,6 +29,7 @@ from sb3_htr.adaptation.loop import adaptation_steps
 from sb3_htr.adaptation.task_bank import MAX_TASKS, TaskBank
 from sb3_htr.common import checks
 from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.random_state import get_generator_state, get_global_state, set_generator_state, set_global_state
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
@@ -111,6 +112,8 @@ class OffPolicyMetaAlgorithm(SAC):
         self.n_tasks_per_rollout = n_tasks_per_rollout
         self.n_episodes_per_task = n_episodes_per_task
         self.task_bank: TaskBank | None = None
+        #: Called after each update
+        self.update_listeners: list[Callable[[], None]] = []
         # Training tasks in the order of the coming rollouts: every task once, then every task once in another order
         self._task_queue = np.zeros(0, dtype=np.int64)
         self._n_rollouts = 0
@@ -207,6 +210,13 @@ class OffPolicyMetaAlgorithm(SAC):
             reset_num_timesteps=reset_num_timesteps,
             progress_bar=progress_bar,
         )
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        shown = super()._init_callback(callback)
+        if progress_bar:
+            shown = CallbackList([shown, MetaProgressBarCallback()])
+            shown.init_callback(self)
+        return shown
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         result = super()._setup_learn(*args, **kwargs)
@@ -422,7 +432,7 @@ class OffPolicyMetaAlgorithm(SAC):
             super().save(temporary, exclude, include)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "knowledge", "task_bank", "_pending_random"]
+        return [*super()._excluded_save_params(), "knowledge", "task_bank", "_pending_random", "update_listeners"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

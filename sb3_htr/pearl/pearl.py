@@ -232,6 +232,8 @@ class PEARL(OffPolicyMetaAlgorithm):
             "rl_reward_mean": (data.rewards * weight).sum(),
             "rl_zero_reward_fraction": th.tensor(data.unrewarded.mean()),
         }
+        for listener in self.update_listeners:
+            listener()
         return mean.detach(), log
 
     def _excluded_save_params(self) -> list[str]:

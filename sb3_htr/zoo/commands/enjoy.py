@@ -46,7 +46,7 @@ def watch(agent: TrainedAgent, args: argparse.Namespace, every: int, show: Show)
     :return: last moment of each task
     :raises ValueError: for a task or a number of episodes that there is not
     """
-    model = agent.load(args.device)
+    model = agent.load(args.device, args.trust)
     env = agent.make_env("rgb_array" if every else None)
     player = Player(model, env, args.explorer, not args.stochastic, args.seed, every)
     tasks: np.ndarray = getattr(get_task_family(player.vec_env), f"{args.tasks}_tasks")

@@ -56,7 +56,7 @@ def adapt(agent: TrainedAgent, args: argparse.Namespace) -> Adapted:
     :return: what happened
     """
     print(f"Adapting {agent.path}")
-    model = agent.load(args.device)
+    model = agent.load(args.device, args.trust)
     family = get_task_family(agent.make_vec_env(1))
     tasks: np.ndarray = getattr(family, f"{args.tasks}_tasks")
     env = agent.make_vec_env(len(tasks))

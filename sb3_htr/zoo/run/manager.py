@@ -33,14 +33,16 @@ from sb3_htr import PEARL
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
 from sb3_htr.common.atomic import WRITE_ERRORS, atomic_path, reason
 from sb3_htr.common.checks import check_keywords, check_numbers
+from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.resume import CheckpointCallback, checkpoints, cut_monitor_files, load_latest
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.pearl.divergence import DivergedError
+from sb3_htr.zoo.run.agents import RECORD, read_record
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback, ProgressCallback
 from sb3_htr.zoo.run.folder import claim, lock
 from sb3_htr.zoo.run.method import DEFAULT, get_method, merged
 from sb3_htr.zoo.run.search_space import convert_pearl_params, sample_pearl_params
-from sb3_htr.zoo.run.yaml_values import without_code
+from sb3_htr.zoo.run.trust import plain_settings
 
 PACKAGES = ("sb3_htr", "stable_baselines3", "gymnasium", "rl_zoo3", "torch", "numpy", "mujoco")
 # What a YAML file may have beside the arguments of PEARL
@@ -54,8 +56,11 @@ class MetaExperimentManager(ExperimentManager):
     rl_zoo3's manager, with task envs stepped as one batch and env arguments of the YAML that reach the evaluation too.
     """
 
-    def __init__(self, *args: Any, method: str | None = None, resumed: Path | None = None, **kwargs: Any) -> None:
+    def __init__(
+        self, *args: Any, method: str | None = None, resumed: Path | None = None, trust: bool = False, **kwargs: Any
+    ) -> None:
         super().__init__(*args, **kwargs)
+        self.trust = trust
         self._method_name = method
         self._unique = kwargs.get("uuid_str", "")
         self.resumed = resumed
@@ -74,7 +79,7 @@ class MetaExperimentManager(ExperimentManager):
         with redirect_stdout(StringIO()):  # it prints what is not all of it
             hyperparams, _ = super().read_hyperparameters()
         self.method = get_method(self._method_name or hyperparams.pop("method", DEFAULT))
-        hyperparams = merged(without_code(hyperparams), self.method.hyperparams())
+        hyperparams = merged(plain_settings(hyperparams, self.config, self.trust), self.method.hyperparams())
         hyperparams = merged(merged(hyperparams, self._trial(trial_id)), given)
         saved = OrderedDict(sorted(hyperparams.items()))
         print(f"Method {self.method.name}: {self.config} has the settings of the env. With those of the command line:")
@@ -226,8 +231,11 @@ class MetaExperimentManager(ExperimentManager):
         # As used: -n may have replaced the file's
         used = {**saved_hyperparams, "n_timesteps": self.n_timesteps}
         if self.resumed is not None:
-            before = json.loads((self.resumed / "run.json").read_text())["hyperparams"]
-            now = json.loads(json.dumps(used))
+            record = read_record(self.resumed / RECORD)
+            before, now = record["hyperparams"], json.loads(json.dumps(used))
+            if before["n_timesteps"] < now["n_timesteps"]:
+                self._write_record({**record, "n_timesteps": self.n_timesteps, "arguments": sys.argv[1:], "hyperparams": now})
+                before = {**before, "n_timesteps": now["n_timesteps"]}
             if before != now:
                 changed = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
                 raise ValueError(
@@ -249,8 +257,11 @@ class MetaExperimentManager(ExperimentManager):
             "versions": {name: version(name) for name in PACKAGES if _is_installed(name)},
             "hyperparams": used,
         }
-        with atomic_path(Path(self.save_path) / "run.json") as path:
-            path.write_text(json.dumps(run, indent=2, default=str))
+        self._write_record(run)
+
+    def _write_record(self, record: dict[str, Any]) -> None:
+        with atomic_path(Path(self.save_path) / RECORD) as path:
+            path.write_text(json.dumps(record, indent=2, default=str))
 
 
 def _is_installed(name: str) -> bool:
@@ -280,7 +291,9 @@ def _soft_interrupt(checkpointing: CheckpointCallback | None) -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def run_rl_zoo(program: str, arguments: list[str], method: str | None = None, resumed: Path | None = None) -> None:
+def run_rl_zoo(
+    program: str, arguments: list[str], method: str | None = None, resumed: Path | None = None, trust: bool = False
+) -> None:
     """
     rl_zoo3's train with PEARL in it.
 
@@ -288,16 +301,18 @@ def run_rl_zoo(program: str, arguments: list[str], method: str | None = None, re
     :param arguments: for it
     :param method: name of the method; that of the YAML file by default
     :param resumed: folder of the run that goes on, None for a new one
+    :param trust: whether files may have code run
     """
     ALGOS["pearl"] = PEARL
     HYPERPARAMS_CONVERTER["pearl"] = convert_pearl_params
-    manager = partial(MetaExperimentManager, method=method, resumed=resumed)
+    manager = partial(MetaExperimentManager, method=method, resumed=resumed, trust=trust)
     # rl_zoo3 looks these names up when it needs them
     replaced: dict[ModuleType, dict[str, Any]] = {
         exp_manager: {
             "EvalCallback": MetaEvalCallback,
             "TrialEvalCallback": MetaTrialEvalCallback,
             "CheckpointCallback": CheckpointCallback,
+            "ProgressBarCallback": MetaProgressBarCallback,
         },
         rl_zoo3.train: {"ExperimentManager": manager},
     }
