@@ -1,6 +1,7 @@
 """Batched task envs for Stable-Baselines3."""
 
 import contextlib
+import copy
 import importlib
 import os
 import warnings
@@ -113,6 +114,17 @@ class PatientResultsWriter(ResultsWriter):
             super().close()
 
 
+class TaskVecMonitor(VecMonitor):
+    """SB3's monitor, of which a deep copy can be made; the copy writes no file."""
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "TaskVecMonitor":
+        shared: dict[str, Any] = {"class_attributes": self.class_attributes, "results_writer": None}
+        result = memo[id(self)] = type(self).__new__(type(self))
+        vars(result).update({key: copy.deepcopy(value, memo) for key, value in vars(self).items() if key not in shared})
+        vars(result).update(shared)
+        return result
+
+
 def make_task_vec_env(
     env_id: str,
     n_envs: int = 1,
@@ -154,9 +166,11 @@ def make_task_vec_env(
         vector_env = gym.make_vec(env_id, n_envs, vectorization_mode="vector_entry_point", **env_kwargs)
         check_has_task_family(hasattr(vector_env, "task_family"))
         venv = BatchedTaskVecEnv(vector_env)
-    monitored = VecMonitor(venv, info_keywords=("is_success",))
+    monitored = TaskVecMonitor(venv, info_keywords=("is_success",))
     if monitor_dir is not None:
         header: dict[str, Any] = {"t_start": monitored.t_start, "env_id": env_id}
         monitored.results_writer = PatientResultsWriter(os.path.join(monitor_dir, "0"), header, monitored.info_keywords)
-    monitored.seed(seed)
+    # Without one, SB3 would draw it from numpy's global generator
+    if seed is not None:
+        monitored.seed(seed)
     return monitored

@@ -4,6 +4,7 @@ import io
 import pathlib
 import pickle
 import warnings
+import zipfile
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
@@ -313,9 +314,8 @@ class OffPolicyMetaAlgorithm(SAC):
         try:
             return next(steps, None)
         except ValueError as error:
-            raise ValueError(
-                f"An env failed {where} ({error}): its observations must have the shape of its observation_space."
-            ) from error
+            shape = ": its observations must have the shape of its observation_space" if "broadcast" in str(error) else ""
+            raise ValueError(f"An env failed {where} ({error}){shape}.") from error
         except (EOFError, ConnectionError) as error:
             raise RuntimeError(
                 f"The process of an env died {where}: its own traceback is printed above. Envs in one process (vec_env dummy) "
@@ -463,9 +463,13 @@ class OffPolicyMetaAlgorithm(SAC):
             )
         file: Any = path if isinstance(path, io.IOBase) else _with_suffix(path, ".pt")
         try:
+            # torch writes a zip file, and does not look at its checksums
+            with zipfile.ZipFile(file) as archive:
+                if archive.testzip() is not None:
+                    raise EOFError
             state = th.load(file, weights_only=True)
             replay, task_bank = state["replay"], state["task_bank"]
-        except (RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError):
+        except (RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError, zipfile.BadZipFile):
             raise ValueError(
                 f"{path} is damaged, or no replay buffer of sb3_htr: pass a file that save_replay_buffer has written."
             ) from None

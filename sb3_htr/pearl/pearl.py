@@ -112,6 +112,8 @@ class PEARL(OffPolicyMetaAlgorithm):
             gamma=(gamma, 0.0, 1.0),
             tau=(tau, 0.0, 1.0),
         )
+        if tau == 0:
+            raise ValueError("tau is 0, with which the target critics would never learn: expected a number above 0, up to 1.")
         if matmul_precision not in PRECISIONS:
             raise ValueError(f"matmul_precision is {matmul_precision!r}, expected one of {list(PRECISIONS)}.")
         super().__init__(

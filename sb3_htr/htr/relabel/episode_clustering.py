@@ -139,11 +139,13 @@ class EpisodeClustering(Relabeller):
         reached = buffer.task_family.hindsight_task(buffer.transitions.trajectory(episode), steps)
         representatives = self.discretiser(reached)
         count = np.array([1 + self._n_episodes_of(representative) for representative in representatives])
-        self._add(representatives[strategy.choose(count[None], rng)[0]], episode)
-        # As many exploratory episodes as make up their share: this one, under a task that others reached
+        reached_task = representatives[strategy.choose(count[None], rng)[0]]
+        self._add(reached_task, episode)
+        # As many exploratory episodes as make up their share: this one, under tasks that others reached, each once
         n_exploratory = self.exploratory_fraction / (1 - self.exploratory_fraction)
-        for _ in range(int(n_exploratory + rng.random())):
-            self._add(self._tasks[rng.integers(self.n_hindsight_buffers)], episode)
+        others = np.delete(np.arange(self.n_hindsight_buffers), self._buffer_of[reached_task.tobytes()])
+        for other in rng.permutation(others)[: int(n_exploratory + rng.random())]:
+            self._add(self._tasks[other], episode)
 
     def _n_episodes_of(self, hindsight_task: np.ndarray) -> int:
         buffer = self._buffer_of.get(hindsight_task.tobytes())

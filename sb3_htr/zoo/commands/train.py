@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 from sb3_htr.common.resume import n_steps_done
@@ -12,6 +13,7 @@ from sb3_htr.zoo.run.method import get_method
 from sb3_htr.zoo.run.shipped import hyperparams_file
 from sb3_htr.zoo.run.trust import check_arguments, import_packages
 
+CONF = ("-conf", "--conf-file")
 HELP = """sb3-htr train: rl_zoo3's train (its arguments follow) with PEARL and evaluations that adapt to validation tasks.
 
 examples:
@@ -73,6 +75,9 @@ def main(argv: Sequence[str]) -> None:
         # Later arguments win, so these are defaults. One thread: two runs on two cores must not fight for them.
         defaults = ["--algo", "pearl", "-conf", str(hyperparams_file()), "--num-threads", "1", "--save-freq", "20000"]
         packages = ["--gym-packages", *args.gym_packages] if args.gym_packages else []
+        for before, word in list(pairwise(rest)):
+            if before in CONF and Path(word).exists():
+                rest[rest.index(word)] = str(Path(word).resolve())  # wherever the run goes on from
         arguments = [*defaults, *rest, *packages]
     keep_freed_memory()
     try:
