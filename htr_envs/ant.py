@@ -184,10 +184,10 @@ class AntEnv(DynamicsEnv):
 
     ## Task distribution
 
-    A task is a goal position `(x, y)` at `goal_distance` from the start, at an angle between 0 and pi. The train and test
-    tasks take evenly spaced angles, shuffled by `task_seed`: the first 80 are train tasks, the next 20 test tasks. The 20
-    validation tasks take uniformly drawn angles. `task_space` is a square that no ant leaves within 200 steps, because a
-    hindsight task is any position that the ant reached.
+    A task is a goal position `(x, y)` at `goal_distance` from the start, at an angle between 0 and pi. The 80 training tasks
+    are four fifths of 100 evenly spaced angles, shuffled by `task_seed`. The 20 validation and the 100 test tasks are drawn,
+    uniformly and in balance: one from each of as many equal sectors. `task_space` is a square that no ant leaves within 200
+    steps, because a hindsight task is any position that the ant reached.
 
     The distance 2, the angles and the 200 steps are MAESN's. The numbers of tasks and their split are those of PEARL's point
     robot, the validation tasks are our choice. A control step is 0.05 s, as in PEARL's ants: MAESN's 0.01 s leave 2 seconds to
@@ -226,9 +226,10 @@ class AntEnv(DynamicsEnv):
     | `goal_distance`       | `2.0`      | distance of the goals from the start                             |
     | `goal_radius`         | `0.4`      | distance to the goal below which it is reached                   |
     | `n_train_tasks`       | `80`       | number of training tasks                                         |
-    | `n_test_tasks`        | `20`       | number of test tasks                                             |
+    | `n_test_tasks`        | `100`      | number of test tasks                                             |
     | `n_validation_tasks`  | `20`       | number of validation tasks                                       |
     | `task_seed`           | `1337`     | seed of the task sets, apart from the run's seed                 |
+    | `held_out`            | `None`     | degrees (from, to): no training tasks, all others                |
 
     `gymnasium.make_vec("SparseAnt-v0", n)` steps n ants in native threads. It takes `n_threads` as well, by default
     `OMP_NUM_THREADS` if that is set, else one for each CPU, with at least 4 ants for each thread.

@@ -9,7 +9,6 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from htr_envs.dynamics import Dynamics, DynamicsEnv, DynamicsVectorEnv
-from htr_envs.rendering import BLUE, ORANGE, PALE_ORANGE, Canvas
 from htr_envs.semicircle_goals import SemicircleGoalFamily
 from htr_envs.task_env import BoolArray, FloatArray
 
@@ -28,7 +27,7 @@ class PointRobotFamily(SemicircleGoalFamily):
     :raises ValueError: if a number is out of range.
     """
 
-    def __init__(self, goal_distance: float = 1.0, goal_radius: float = 0.2, **task_sets: int) -> None:
+    def __init__(self, goal_distance: float = 1.0, goal_radius: float = 0.2, **task_sets: Any) -> None:
         super().__init__(ARENA, goal_distance, goal_radius, **task_sets)
 
 
@@ -56,16 +55,19 @@ class PointRobotDynamics(Dynamics[PointRobotFamily]):
 
         :return: picture (400, 400, 3), uint8.
         """
+        # imported here: who never renders needs no Pillow
+        from htr_envs.rendering import BLUE, ORANGE, PALE_ORANGE, Canvas
+
         distance, radius = task_family.goal_distance, task_family.goal_radius
         # 20 steps lead at most 2 along each axis: a robot of that episode length never leaves the picture
         canvas = Canvas(max(2.2, 1.1 * distance + radius))
         canvas.circle((0.0, 0.0), distance, 3, PALE_ORANGE, upper_half=True)
         canvas.axes()
         reached = bool(np.hypot(*(path[-1] - task)) < radius)
-        canvas.disc(task, radius, ORANGE, 1.0 if reached else 0.5)
+        canvas.disc(task, radius, ORANGE if reached else PALE_ORANGE)
         canvas.circle(task, radius, 2, ORANGE)
         canvas.path(path)
-        canvas.legend([("GOAL", ORANGE), ("START", None), ("ROBOT", BLUE)])
+        canvas.legend([("hidden goal", ORANGE), ("start", None), ("robot", BLUE)])
         return canvas.image()
 
 
@@ -106,10 +108,10 @@ class PointRobotEnv(DynamicsEnv):
 
     ## Task distribution
 
-    A task is a goal position `(x, y)` at `goal_distance` from the start, at an angle between 0 and pi. The train and test
-    tasks take evenly spaced angles, shuffled by `task_seed`: the first 80 are train tasks, the next 20 test tasks. The 20
-    validation tasks take uniformly drawn angles. `task_space` is the whole arena, because a hindsight task is any position
-    that the robot reached.
+    A task is a goal position `(x, y)` at `goal_distance` from the start, at an angle between 0 and pi. The 80 training tasks
+    are four fifths of 100 evenly spaced angles, shuffled by `task_seed`. The 20 validation and the 100 test tasks are drawn,
+    uniformly and in balance: one from each of as many equal sectors. `task_space` is the whole arena, because a hindsight task
+    is any position that the robot reached.
 
     The paper gives the two rewards and the radius 0.2. It does not give the goal distance, the number of tasks, their split,
     the episode length and the step size: those are PEARL's values, taken from its reference implementation. The validation
@@ -139,9 +141,10 @@ class PointRobotEnv(DynamicsEnv):
     | `goal_distance`      | `1.0`      | distance of the goals from the start                              |
     | `goal_radius`        | `0.2`      | distance to the goal below which it is reached                    |
     | `n_train_tasks`      | `80`       | number of training tasks                                          |
-    | `n_test_tasks`       | `20`       | number of test tasks                                              |
+    | `n_test_tasks`       | `100`      | number of test tasks                                              |
     | `n_validation_tasks` | `20`       | number of validation tasks                                        |
     | `task_seed`          | `1337`     | seed of the task sets, apart from the run's seed                  |
+    | `held_out`           | `None`     | degrees (from, to): no training tasks, all others                 |
     | `reward_type`        | `"sparse"` | reward of `step`, `"sparse"` or `"dense"`                         |
     | `render_mode`        | `None`     | `"rgb_array"` for pictures                                        |
 

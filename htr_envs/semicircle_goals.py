@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, at_step, check_reward_type, split_evenly
+from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, at_step, check_reward_type, draw_task_sets
 
 LOCOMOTION_ARENA = 20.0  # a robot gets up to 10 in 200 steps
 
@@ -17,8 +19,9 @@ class SemicircleGoalFamily(TaskFamily):
     A step is worth 1 minus the distance to the goal within the goal radius, and 0 outside, which is the formula that the HTR
     paper (appendix A.3) gives for the point robot.
 
-    The angles of the train and test tasks are evenly spaced and shuffled; those of the validation tasks are drawn uniformly.
-    Everything follows ``task_seed``, never the seed of a run. The first two numbers of an observation are the position.
+    The angles of the training tasks are evenly spaced, those of validation and test tasks drawn uniformly and in balance, see
+    :func:`draw_task_sets`. Everything follows ``task_seed``, never the seed of a run. The first two numbers of an observation
+    are the position.
 
     :param arena: goals and hindsight goals lie in the square [-arena, arena]^2.
     :param goal_distance: distance of the goals from the start at (0, 0).
@@ -27,6 +30,8 @@ class SemicircleGoalFamily(TaskFamily):
     :param n_test_tasks: how many test tasks.
     :param n_validation_tasks: how many validation tasks.
     :param task_seed: seed of the task sets.
+    :param held_out: a sector, from and to an angle in degrees, that training tasks avoid and validation and test tasks lie in:
+        a split that cannot be interpolated. None for no such split.
     :raises ValueError: if a number is out of range.
     """
 
@@ -36,9 +41,10 @@ class SemicircleGoalFamily(TaskFamily):
         goal_distance: float,
         goal_radius: float,
         n_train_tasks: int = 80,
-        n_test_tasks: int = 20,
+        n_test_tasks: int = 100,
         n_validation_tasks: int = 20,
         task_seed: int = 1337,
+        held_out: tuple[float, float] | None = None,
     ) -> None:
         if not 0.0 < goal_distance <= arena:
             raise ValueError(f"goal_distance is {goal_distance}, expected a number above 0 and up to {arena}.")
@@ -48,8 +54,9 @@ class SemicircleGoalFamily(TaskFamily):
             )
         self.goal_distance = float(goal_distance)
         self.goal_radius = float(goal_radius)
-        angles = split_evenly(0.0, np.pi, n_train_tasks, n_validation_tasks, n_test_tasks, task_seed)
-        train, validation, test = map(self._goals, angles)
+        sector = None if held_out is None else (held_out[0] / 180.0, held_out[1] / 180.0)
+        drawn = draw_task_sets(n_train_tasks, n_validation_tasks, n_test_tasks, task_seed, sector)
+        train, validation, test = (self._goals(np.pi * values) for values in drawn)
         super().__init__(
             task_space=spaces.Box(-arena, arena, (2,), np.float32),
             train_tasks=train,
@@ -130,5 +137,5 @@ class LocomotionFamily(SemicircleGoalFamily):
     :raises ValueError: if a number is out of range.
     """
 
-    def __init__(self, goal_distance: float = 2.0, goal_radius: float = 0.5, **task_sets: int) -> None:
+    def __init__(self, goal_distance: float = 2.0, goal_radius: float = 0.5, **task_sets: Any) -> None:
         super().__init__(LOCOMOTION_ARENA, goal_distance, goal_radius, **task_sets)

@@ -9,8 +9,7 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from htr_envs.dynamics import Dynamics, DynamicsEnv, DynamicsVectorEnv
-from htr_envs.rendering import BLUE, ORANGE, PALE_ORANGE, Canvas
-from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, at_step, check_reward_type, split_evenly
+from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, at_step, check_reward_type, draw_task_sets
 
 FRICTION = np.float32(0.95)
 THRUST = np.float32(0.2)
@@ -41,7 +40,7 @@ class TargetSpeedFamily(TaskFamily):
         max_speed: float = 3.0,
         tolerance: float = 0.1,
         n_train_tasks: int = 80,
-        n_test_tasks: int = 20,
+        n_test_tasks: int = 100,
         n_validation_tasks: int = 20,
         task_seed: int = 1337,
     ) -> None:
@@ -54,8 +53,8 @@ class TargetSpeedFamily(TaskFamily):
         self.min_speed = float(min_speed)
         self.max_speed = float(max_speed)
         self.tolerance = float(tolerance)
-        speeds = split_evenly(min_speed, max_speed, n_train_tasks, n_validation_tasks, n_test_tasks, task_seed)
-        train, validation, test = (values[:, None] for values in speeds)
+        drawn = draw_task_sets(n_train_tasks, n_validation_tasks, n_test_tasks, task_seed)
+        train, validation, test = (min_speed + (max_speed - min_speed) * values[:, None] for values in drawn)
         super().__init__(
             # the corner of the box of velocities, rounded up
             task_space=spaces.Box(0.0, np.float32(1.5 * TOP_SPEED), (1,), np.float32),
@@ -144,13 +143,15 @@ class TargetSpeedDynamics(Dynamics[TargetSpeedFamily]):
 
         :return: picture (400, 400, 3), uint8.
         """
+        from htr_envs.rendering import BLUE, ORANGE, PALE_ORANGE, Canvas  # who never renders needs no Pillow
+
         (speed,), tolerance = task.tolist(), task_family.tolerance
         canvas = Canvas(4.2)
         held = bool(abs(np.hypot(*path[-1]) - speed) < tolerance)
         canvas.circle((0.0, 0.0), speed, 2 * tolerance / canvas.pixel, ORANGE if held else PALE_ORANGE)
         canvas.axes()
         canvas.path(path)
-        canvas.legend([("TARGET SPEED", ORANGE), ("START", None), ("SLEDGE", BLUE)])
+        canvas.legend([("hidden target speed", ORANGE), ("start", None), ("sledge", BLUE)])
         return canvas.image()
 
 
@@ -193,11 +194,11 @@ class TargetSpeedEnv(DynamicsEnv):
 
     ## Task distribution
 
-    A task is a speed between `min_speed` and `max_speed`. The train and test tasks are evenly spaced, shuffled by `task_seed`;
-    the validation tasks are drawn uniformly. `task_space` goes from 0 beyond the largest possible speed, because a hindsight
-    task is any speed that was reached. The family is our own, its numbers chosen such that undirected thrust does not get
-    there: a uniformly random policy holds its target at some step of 0.014 % of its episodes
-    (27 of 200,000 measured).
+    A task is a speed between `min_speed` and `max_speed`. The 80 training tasks are four fifths of 100 evenly spaced speeds,
+    shuffled by `task_seed`; validation and test tasks are drawn uniformly and in balance. `task_space` goes from 0 beyond the
+    largest possible speed, because a hindsight task is any speed that was reached. The family is our own, its numbers chosen
+    such that undirected thrust does not get there: a uniformly random policy holds its target at some step of 0.014 % of its
+    episodes (27 of 200,000 measured).
 
     ## Starting State
 
@@ -221,7 +222,7 @@ class TargetSpeedEnv(DynamicsEnv):
     | `max_speed`          | `3.0`      | largest target speed                                              |
     | `tolerance`          | `0.1`      | difference to the target speed below which it is held             |
     | `n_train_tasks`      | `80`       | number of training tasks                                          |
-    | `n_test_tasks`       | `20`       | number of test tasks                                              |
+    | `n_test_tasks`       | `100`      | number of test tasks                                              |
     | `n_validation_tasks` | `20`       | number of validation tasks                                        |
     | `task_seed`          | `1337`     | seed of the task sets, apart from the run's seed                  |
     | `reward_type`        | `"sparse"` | reward of `step`, `"sparse"` or `"dense"`                         |

@@ -127,10 +127,10 @@ class WheeledEnv(DynamicsEnv):
 
     ## Task distribution
 
-    A task is a goal position `(x, y)` at `goal_distance` from the start, at an angle between 0 and pi. The train and test
-    tasks take evenly spaced angles, shuffled by `task_seed`: the first 80 are train tasks, the next 20 test tasks. The 20
-    validation tasks take uniformly drawn angles. `task_space` is a square that no robot leaves within 200 steps, because a
-    hindsight task is any position that the robot reached.
+    A task is a goal position `(x, y)` at `goal_distance` from the start, at an angle between 0 and pi. The 80 training tasks
+    are four fifths of 100 evenly spaced angles, shuffled by `task_seed`. The 20 validation and the 100 test tasks are drawn,
+    uniformly and in balance: one from each of as many equal sectors. `task_space` is a square that no robot leaves within 200
+    steps, because a hindsight task is any position that the robot reached.
 
     The distance 2, the angles and the 200 steps of 0.01 s are MAESN's. The numbers of tasks and their split are those of
     PEARL's point robot, the validation tasks are our choice. So is the radius 0.5, where MAESN has 0.8: a larger disc makes
@@ -166,9 +166,10 @@ class WheeledEnv(DynamicsEnv):
     | `goal_distance`      | `2.0`      | distance of the goals from the start               |
     | `goal_radius`        | `0.5`      | distance to the goal below which it is reached     |
     | `n_train_tasks`      | `80`       | number of training tasks                           |
-    | `n_test_tasks`       | `20`       | number of test tasks                               |
+    | `n_test_tasks`       | `100`      | number of test tasks                               |
     | `n_validation_tasks` | `20`       | number of validation tasks                         |
     | `task_seed`          | `1337`     | seed of the task sets, apart from the run's seed   |
+    | `held_out`           | `None`     | degrees (from, to): no training tasks, all others  |
 
     MAESN's control cost, 0.05 times the squared control of up to 2, is up to 0.4 a step. Beside a reward of at most 1 that
     only few steps see, it would pay to stand still. The default costs at most 0.01 a step.

@@ -10,7 +10,7 @@ import torch as th
 from stable_baselines3.common.callbacks import EvalCallback
 
 from sb3_htr.adaptation.evaluation import MetaLearner, record_adaptation
-from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.atomic import WRITE_ERRORS, atomic_path, reason
 from sb3_htr.common.checks import get_task_family
 
 
@@ -113,8 +113,8 @@ class MetaEvalCallback(EvalCallback):
         """Whether it could be written: a disk that is full stops no training."""
         try:
             save(path)
-        except OSError as error:
-            warnings.warn(f"{path} could not be written ({error.strerror or error}). Training goes on.", stacklevel=2)
+        except WRITE_ERRORS as error:
+            warnings.warn(f"{path} could not be written ({reason(error)}). Training goes on.", stacklevel=2)
             return False
         return True
 

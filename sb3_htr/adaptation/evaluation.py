@@ -101,7 +101,7 @@ def record_adaptation(
         raise ValueError(f"n_episodes is {n_episodes}, expected at least 1.")
     n_tasks = 20 if tasks is None else len(tasks)
     if isinstance(env, str):
-        env = make_task_vec_env(env, max(n_tasks, 1))
+        env = make_task_vec_env(env, max(n_tasks, 1), seed)
     elif isinstance(env, gym.Env):
         env = BaseAlgorithm._wrap_env(env, monitor_wrapper=False)
     check_is_not_normalized(env)

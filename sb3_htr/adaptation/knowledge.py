@@ -75,9 +75,11 @@ class LatentKnowledge(nn.Module):
         :param means: (n, latent_dim), posterior means of recent meta-batches
         """
         self.mean.copy_(means.mean(dim=0))
-        centred = means - self.mean
-        jitter = 1e-6 * th.eye(self.latent_dim, device=means.device)
-        self.cholesky.copy_(th.linalg.cholesky(centred.T @ centred / len(means) + jitter))
+        centred = (means - self.mean).double()
+        covariance = centred.T @ centred / len(means)
+        # However large the means are, and if they are all the same
+        jitter = (1e-6 + 1e-9 * covariance.trace()) * th.eye(self.latent_dim, dtype=th.float64, device=means.device)
+        self.cholesky.copy_(th.linalg.cholesky(covariance + jitter))
 
     def sample_aggregate(self, n: int, scale: float, generator: th.Generator | None = None) -> np.ndarray:
         """

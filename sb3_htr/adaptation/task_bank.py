@@ -34,18 +34,19 @@ class TaskBank:
         self.best_return = np.zeros(n_tasks, dtype=np.float32)
         self.length = np.zeros(n_tasks, dtype=np.int64)
         self.episodes = np.zeros((n_tasks, 0, transitions.width), dtype=np.float32)
-        self._new: list[np.ndarray] = []
+        #: Training tasks and transitions of the episodes since the last :meth:`update`
+        self.new: list[tuple[int, np.ndarray]] = []
 
     def on_episode(self, task: int, episode: np.ndarray) -> None:
         """
-        :param task: not used: it is rewarded under all of them
+        :param task: index of the training task that it was collected on
         :param episode: (length, width) float32, taken in at the next :meth:`update`
         """
-        self._new.append(episode.copy())
+        self.new.append((task, episode.copy()))
 
     def update(self) -> None:
-        """Reward the episodes since the last call under the tasks."""
-        new, self._new = self._new, []
+        """Reward the new episodes under all tasks."""
+        new, self.new = [episode for _, episode in self.new], []
         for start in range(0, len(new), CHUNK):
             self._update(new[start : start + CHUNK])
 

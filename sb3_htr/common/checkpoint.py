@@ -49,7 +49,7 @@ def read_checkpoint(folder: str | os.PathLike[str], device: th.device | str = "c
         manifest = json.loads((folder / MANIFEST).read_text())
         found, expected = manifest["format"], manifest["sha256"][STATE]
         writer = manifest["versions"]["sb3_htr"]
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         raise DamagedCheckpoint(f"{folder} has no readable {MANIFEST}: it is damaged, or no checkpoint.") from None
     if found != FORMAT:
         raise DamagedCheckpoint(f"{folder} has format {found}, expected {FORMAT}: read it with sb3_htr {writer}, its writer.")

@@ -1,16 +1,24 @@
 """Says early and in one sentence why an env cannot be meta-trained on."""
 
 import difflib
+import hashlib
 import inspect
+import re
 from collections.abc import Callable, Iterable
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_htr.common.type_aliases import TaskFamily
 
+# Wrappers of single envs that are known to change rewards
+REWARD_WRAPPERS: dict[str, type[gym.Wrapper]] = {
+    "gymnasium's RewardWrapper": gym.RewardWrapper,
+    "gymnasium's NormalizeReward": gym.wrappers.NormalizeReward,
+}
 TASK_ENV_ADVICE = "derive the env from htr_envs.TaskEnv and test it with htr_envs.check_task_env"
 VARIADIC = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
 
@@ -87,18 +95,6 @@ def get_task_family(env: VecEnv) -> TaskFamily:
     return family
 
 
-def check_reward_is_sparse(env: VecEnv) -> None:
-    """
-    :param env: env to train on
-    :raises ValueError: if it gives the dense proxy reward
-    """
-    if env.has_attr("reward_type") and env.get_attr("reward_type")[0] != "sparse":
-        raise ValueError(
-            "The env's reward_type is not 'sparse', but context and relabelled rewards are: make the env with "
-            "reward_type='sparse', and for the dense baseline pass replay_buffer_kwargs={'rl_reward_type': 'dense'}."
-        )
-
-
 def get_max_episode_steps(env: VecEnv) -> int:
     """
     :param env: env to train on
@@ -118,9 +114,60 @@ def get_max_episode_steps(env: VecEnv) -> int:
     return int(limit)
 
 
-def check_is_not_normalized(env: VecEnv) -> None:
+def family_facts(family: TaskFamily) -> dict[str, str]:
+    """
+    :param family: of an env, or of a replay buffer
+    :return: its class and its attributes in words, arrays as checksums: the same for two families that reward alike
+    """
+
+    def fact(value: Any) -> str:
+        if isinstance(value, np.ndarray):
+            return f"array of shape {value.shape}, {hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()[:12]}"
+        # An object that does not say what it is names its address
+        return re.sub(r" at 0x[0-9a-f]+", "", repr(value))
+
+    attributes = getattr(family, "__dict__", {})
+    return {"class": type(family).__qualname__, **{name: fact(value) for name, value in sorted(attributes.items())}}
+
+
+def check_same_family(before: dict[str, str], now: dict[str, str], what: str) -> None:
+    """
+    :param before: :func:`family_facts` of what was collected
+    :param now: of what comes in
+    :param what: comes in, for the message
+    :raises ValueError: if they differ, naming the first difference
+    """
+    different = [name for name in {**before, **now} if before.get(name) != now.get(name)]
+    if different:
+        name = different[0]
+        raise ValueError(
+            f"{what} has another task family: its {name} is {now.get(name)}, that of the collected experience is "
+            f"{before.get(name)}. Relabelled rewards would be wrong: make a new model."
+        )
+
+
+def check_rewards(env: VecEnv) -> None:
     """
     :param env: env to train on
+    :raises ValueError: if something stands between its rewards and the replay buffer, or they are the dense proxy
+    """
+    changed_by = next((name for name, kind in REWARD_WRAPPERS.items() if any(env.env_is_wrapped(kind))), None)
+    if changed_by is not None:
+        raise ValueError(
+            f"The env is in {changed_by}, which changes its rewards, but relabelled rewards are those of its task family: "
+            "leave the wrapper away."
+        )
+    if env.has_attr("reward_type") and env.get_attr("reward_type")[0] != "sparse":
+        raise ValueError(
+            "The env's reward_type is not 'sparse', but context and relabelled rewards are: make the env with "
+            "reward_type='sparse', and for the dense baseline pass replay_buffer_kwargs={'rl_reward_type': 'dense'}."
+        )
+    check_is_not_normalized(env)
+
+
+def check_is_not_normalized(env: VecEnv) -> None:
+    """
+    :param env: env to train on, or to adapt to
     :raises ValueError: if it is in SB3's VecNormalize
     """
     if unwrap_vec_normalize(env) is not None:

@@ -34,6 +34,8 @@ class ObservationNormalizer(nn.Module):
         """
         :param obs: (n, obs_dim), newly observed
         """
+        if not np.isfinite(obs).all():
+            return  # the replay buffer says so, and the statistics stay as they are
         moments = RunningMeanStd(shape=self.mean.shape)
         moments.mean, moments.var = self.mean.cpu().numpy(), self.variance.cpu().numpy()
         moments.count = self.count.item()

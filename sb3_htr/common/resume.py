@@ -10,7 +10,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import TensorBoardOutputFormat
 
-from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.atomic import WRITE_ERRORS, atomic_path, reason
 from sb3_htr.common.checkpoint import DamagedCheckpoint, read_checkpoint, write_checkpoint
 
 # What is recorded but not written yet
@@ -35,8 +35,16 @@ def checkpoints(run: Path) -> list[Path]:
     :param run: folder of a run
     :return: its checkpoints, the latest first
     """
-    folders = [path for path in (run / "checkpoints").glob("*_steps") if path.name.split("_")[0].isdigit()]
+    folders = [path for path in (run / "checkpoints").glob("*_steps") if path.name.split("_")[0].isdecimal()]
     return sorted(folders, key=lambda path: int(path.name.split("_")[0]), reverse=True)
+
+
+def n_steps_done(run: Path) -> int:
+    """
+    :param run: folder of a run
+    :return: env steps before its latest checkpoint, 0 without one
+    """
+    return max((int(path.name.split("_")[0]) for path in checkpoints(run)), default=0)
 
 
 def load_latest(run: Path, device: str = "cpu") -> tuple[Path, dict[str, Any]]:
@@ -76,9 +84,10 @@ def cut_monitor_files(run: Path, folder: Path, sizes: dict[str, int]) -> None:
 
 class CheckpointCallback(BaseCallback):
     """
-    Saves all that a training is, between rollouts, as ``<save_path>/checkpoints/<steps>_steps/``.
+    Saves all that a training is, between rollouts and at its end, as ``<save_path>/checkpoints/<steps>_steps/``.
 
-    A disk that is full stops no training: the checkpoint is tried again before the next rollout.
+    A disk that is full, or an old checkpoint that cannot be removed, stops no training: what failed is tried again before the
+    next rollout.
 
     :param save_freq: smallest number of calls (steps of the VecEnv) between two checkpoints
     :param save_path: folder of the run
@@ -148,32 +157,40 @@ class CheckpointCallback(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         # A rollout begins with a reset of all envs, so nothing is lost by stopping just before it
-        if self.n_calls - self._last_calls < self.save_freq and not self.stopping:
-            return
+        if self.n_calls - self._last_calls >= self.save_freq or self.stopping:
+            self._save()
+
+    def _save(self) -> None:
         folder = self.run / "checkpoints" / f"{self.num_timesteps}_steps"
+        self._stopped = self.stopping
         try:
             write_checkpoint(folder, self._state())
-        except OSError as error:
+        except WRITE_ERRORS as error:
             warnings.warn(
-                f"The checkpoint {folder} could not be written ({error.strerror or error}). Training goes on, and tries again "
-                "before the next rollout.",
+                f"The checkpoint {folder} could not be written ({reason(error)}). Training goes on, and tries again before "
+                "the next rollout.",
                 stacklevel=2,
             )
             return
         self._last_calls = self.n_calls
-        self._stopped = self.stopping
         if self.verbose > 0:
             print(f"Checkpoint: {folder}")
         self._remove_old()
 
     def _on_training_end(self) -> None:
+        # Not in the middle of a rollout, where a callback may have stopped
+        if not self._stopped and self.num_timesteps >= self.model._total_timesteps and self.n_calls > self._last_calls:
+            self._save()
         # A process killed between writing its last checkpoint and cleaning up leaves that to the one that goes on
         self._remove_old()
 
     def _remove_old(self) -> None:
         # Those of killed processes, too
         for old in [*checkpoints(self.run)[self.keep :], *(self.run / "checkpoints").glob(".*_steps.*.tmp")]:
-            shutil.rmtree(old)
+            try:
+                shutil.rmtree(old)
+            except OSError as error:
+                warnings.warn(f"The old checkpoint {old} could not be removed ({reason(error)}). Training goes on.")
 
     def _state(self) -> dict[str, Any]:
         return {

@@ -1,18 +1,21 @@
 """Batched task envs for Stable-Baselines3."""
 
+import contextlib
+import copy
 import importlib
 import os
-from collections.abc import Sequence
-from functools import partial
+import warnings
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+from stable_baselines3.common.monitor import ResultsWriter
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
+from sb3_htr.common.atomic import reason
 from sb3_htr.common.checks import check_has_task_family, check_numbers
 
 # Attributes of a single task env, and where a batched one keeps those of all envs
@@ -97,12 +100,39 @@ class BatchedTaskVecEnv(VecEnv):
         return [None] * self.num_envs
 
 
+class PatientResultsWriter(ResultsWriter):
+    """Writes SB3's monitor file as long as that is possible: a disk that is full stops no training."""
+
+    def write_row(self, epinfo: dict[str, float]) -> None:
+        try:
+            super().write_row(epinfo)
+        except OSError as error:
+            warnings.warn(f"{self.file_handler.name} could not be written ({reason(error)}). Training goes on.")
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):  # what could not be written before
+            super().close()
+
+
+class TaskVecMonitor(VecMonitor):
+    """SB3's monitor, of which a deep copy can be made; the copy writes no file."""
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "TaskVecMonitor":
+        shared: dict[str, Any] = {"class_attributes": self.class_attributes, "results_writer": None}
+        result = memo[id(self)] = type(self).__new__(type(self))
+        vars(result).update({key: copy.deepcopy(value, memo) for key, value in vars(self).items() if key not in shared})
+        vars(result).update(shared)
+        return result
+
+
 def make_task_vec_env(
     env_id: str,
     n_envs: int = 1,
     seed: int | None = None,
     monitor_dir: str | None = None,
     env_kwargs: dict[str, Any] | None = None,
+    wrapper: Callable[[gym.Env], gym.Env] | None = None,
+    vec_env_class: type[DummyVecEnv | SubprocVecEnv] | None = None,
 ) -> VecEnv:
     """
     Make ``n_envs`` copies of a registered task env: natively batched where its registration offers that, else one by one.
@@ -112,6 +142,8 @@ def make_task_vec_env(
     :param seed: seed of the envs' own randomness
     :param monitor_dir: folder for the CSV of episode returns, none by default
     :param env_kwargs: arguments of the env
+    :param wrapper: of each single env
+    :param vec_env_class: of single envs; by default they are natively batched if they can be, else in this process
     :return: a monitored VecEnv
     :raises ValueError: for an env without tasks, or no envs
     """
@@ -119,14 +151,26 @@ def make_task_vec_env(
     module, _, env_id = env_id.rpartition(":")
     if module:
         importlib.import_module(module)
-    spec = gym.spec(env_id)
-    if spec.vector_entry_point is None:
-        # By its id, SB3 would ask for a render mode, which an env need not have
-        make = partial(gym.make, env_id)
-        return make_vec_env(make, n_envs, seed=seed, monitor_dir=monitor_dir, env_kwargs=env_kwargs)
-    vector_env = gym.make_vec(env_id, n_envs, vectorization_mode="vector_entry_point", **(env_kwargs or {}))
-    check_has_task_family(hasattr(vector_env, "task_family"))
-    monitor_file = None if monitor_dir is None else os.path.join(monitor_dir, "0.monitor.csv")
-    venv = VecMonitor(BatchedTaskVecEnv(vector_env), monitor_file, info_keywords=("is_success",))
-    venv.seed(seed)
-    return venv
+    spec, env_kwargs = gym.spec(env_id), env_kwargs or {}
+    venv: VecEnv
+    if spec.vector_entry_point is None or wrapper is not None or vec_env_class is not None:
+
+        def make_env() -> gym.Env:
+            # Not by its id alone: in a process of its own, the registry may not have it
+            env = gym.make(spec, **env_kwargs)
+            return env if wrapper is None else wrapper(env)
+
+        venv = (vec_env_class or DummyVecEnv)([make_env] * n_envs)
+        check_has_task_family(venv.has_attr("task_family"))
+    else:
+        vector_env = gym.make_vec(env_id, n_envs, vectorization_mode="vector_entry_point", **env_kwargs)
+        check_has_task_family(hasattr(vector_env, "task_family"))
+        venv = BatchedTaskVecEnv(vector_env)
+    monitored = TaskVecMonitor(venv, info_keywords=("is_success",))
+    if monitor_dir is not None:
+        header: dict[str, Any] = {"t_start": monitored.t_start, "env_id": env_id}
+        monitored.results_writer = PatientResultsWriter(os.path.join(monitor_dir, "0"), header, monitored.info_keywords)
+    # Without one, SB3 would draw it from numpy's global generator
+    if seed is not None:
+        monitored.seed(seed)
+    return monitored

@@ -1,7 +1,7 @@
 """Task-indexed replay with hindsight task relabelling at sample time."""
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 
-from sb3_htr.common.checks import check_numbers
+from sb3_htr.common.checks import check_numbers, check_same_family, family_facts
 from sb3_htr.common.random_state import get_generator_state, set_generator_state
 from sb3_htr.common.settings import make
 from sb3_htr.common.type_aliases import Context, MultiTaskSamples, TaskFamily
@@ -221,13 +221,13 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         name = next(name for name, column in columns.items() if not np.isfinite(rows[i, column]).all())
         raise ValueError(f"The {name} of task {task[i]} (env {i}) is {rows[i, columns[name]]}, expected finite numbers.")
 
-    def check_reward_hook(self) -> None:
+    def check_reward_hook(self, episodes: Sequence[tuple[int, np.ndarray]]) -> None:
         """
-        :raises ValueError: if the reward hook disagrees with what the env gave for the stored episodes
+        :param episodes: training tasks and transitions (length, width) of some episodes
+        :raises ValueError: if the reward hook disagrees with what the env gave for them
         """
-        index = self.episodes.index()
-        rows = self.episodes.rows[index.rows]
-        task = np.repeat(np.arange(self.n_tasks), np.diff(index.task_row))
+        rows = np.concatenate([episode for _, episode in episodes])
+        task = np.repeat([task for task, _ in episodes], [len(episode) for _, episode in episodes])
         traj = self.transitions.trajectory(rows[:, None])
         computed = self.task_family.compute_reward(traj, self.task_family.train_tasks[task])[:, 0]
         given = rows[:, self.transitions.reward]
@@ -257,13 +257,16 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         return {
             "episodes": self.episodes.state_dict(),
             "relabeller": self.relabeller.state_dict(),
+            "task_family": family_facts(self.task_family),
             "random": [get_generator_state(generator) for generator in (self._rng, self.relabel_rng)],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """
         :param state: of :meth:`state_dict` of a buffer with the same settings
+        :raises ValueError: if it is of another task family, or of a store of other sizes
         """
+        check_same_family(state["task_family"], family_facts(self.task_family), "This model's env")
         self.episodes.load_state_dict(state["episodes"])
         self.relabeller.load_state_dict(state["relabeller"])
         for generator, saved in zip((self._rng, self.relabel_rng), state["random"], strict=True):

@@ -4,8 +4,9 @@ import io
 import pathlib
 import pickle
 import warnings
+import zipfile
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import IO, Any, TypeVar, cast
 
@@ -13,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, TrainFreq
 from stable_baselines3.common.utils import check_for_correct_spaces
@@ -29,6 +30,7 @@ from sb3_htr.adaptation.loop import adaptation_steps
 from sb3_htr.adaptation.task_bank import MAX_TASKS, TaskBank
 from sb3_htr.common import checks
 from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.random_state import get_generator_state, get_global_state, set_generator_state, set_global_state
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
@@ -111,6 +113,8 @@ class OffPolicyMetaAlgorithm(SAC):
         self.n_tasks_per_rollout = n_tasks_per_rollout
         self.n_episodes_per_task = n_episodes_per_task
         self.task_bank: TaskBank | None = None
+        #: Called after each update
+        self.update_listeners: list[Callable[[], None]] = []
         # Training tasks in the order of the coming rollouts: every task once, then every task once in another order
         self._task_queue = np.zeros(0, dtype=np.int64)
         self._n_rollouts = 0
@@ -131,8 +135,7 @@ class OffPolicyMetaAlgorithm(SAC):
         self._introduce_policy()
 
     def _setup_replay(self, env: VecEnv) -> None:
-        checks.check_is_not_normalized(env)
-        checks.check_reward_is_sparse(env)
+        checks.check_rewards(env)
         family = checks.get_task_family(env)
         buffer_class = cast(type[MultiTaskReplayBuffer], self.replay_buffer_class)
         self.replay_buffer = buffer_class(
@@ -157,13 +160,16 @@ class OffPolicyMetaAlgorithm(SAC):
         """
         :param env: env of the same spaces and number of copies; its task family replaces the old one if nothing was collected
         :param force_reset: reset before training goes on
+        :raises ValueError: if there is experience of another task family, or something changes the env's rewards
         """
-        if isinstance(env, VecEnv):
-            checks.check_is_not_normalized(env)
-        super().set_env(env, force_reset)
-        assert self.env is not None
-        if self.replay_buffer is None:
-            self._setup_replay(self.env)
+        vec_env = self._wrap_env(env)
+        checks.check_rewards(vec_env)
+        if self.replay_buffer is not None and self.replay_buffer.size() > 0:
+            known = checks.family_facts(self.replay_buffer.task_family)
+            checks.check_same_family(known, checks.family_facts(checks.get_task_family(vec_env)), "The env")
+        super().set_env(vec_env, force_reset)
+        if self.replay_buffer is None or self.replay_buffer.size() == 0:
+            self._setup_replay(vec_env)
             self._introduce_policy()
 
     def set_random_seed(self, seed: int | None = None) -> None:
@@ -206,6 +212,13 @@ class OffPolicyMetaAlgorithm(SAC):
             progress_bar=progress_bar,
         )
 
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        shown = super()._init_callback(callback)
+        if progress_bar:
+            shown = CallbackList([shown, MetaProgressBarCallback()])
+            shown.init_callback(self)
+        return shown
+
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         result = super()._setup_learn(*args, **kwargs)
         if self._pending_random is not None:
@@ -231,16 +244,8 @@ class OffPolicyMetaAlgorithm(SAC):
         Adapt to ``n_tasks_per_rollout`` training tasks, one per env at a time, and store all that happens.
 
         Each env stays on its task until every env has finished ``n_episodes_per_task`` episodes; envs whose episodes are
-        shorter go on with more of them.
-
-        :param env: training env
-        :param callback: called at every step
-        :param train_freq: not used, a rollout is whole adaptations
-        :param replay_buffer: where the steps go
-        :param action_noise: not used
-        :param learning_starts: env steps with random actions
-        :param log_interval: rollouts between two logs
-        :return: what was collected
+        shorter go on with more of them. ``train_freq`` and ``action_noise`` are not used: a rollout is whole adaptations, and
+        z explores.
         """
         assert self.task_bank is not None
         self.policy.set_training_mode(False)
@@ -251,8 +256,8 @@ class OffPolicyMetaAlgorithm(SAC):
             for _ in range(-(-self.n_tasks_per_rollout // env.num_envs))
         )
         if continue_training:
-            if self._n_rollouts == 0:
-                replay_buffer.check_reward_hook()
+            # In each rollout: a sparse reward can go unseen for many, and the env may be another one than before
+            replay_buffer.check_reward_hook(self.task_bank.new)
             self.task_bank.update()
             self.logger.record("rollout/train_tasks_reached", len(self.task_bank.solved))
             callback.on_rollout_end()
@@ -309,9 +314,8 @@ class OffPolicyMetaAlgorithm(SAC):
         try:
             return next(steps, None)
         except ValueError as error:
-            raise ValueError(
-                f"An env failed {where} ({error}): its observations must have the shape of its observation_space."
-            ) from error
+            shape = ": its observations must have the shape of its observation_space" if "broadcast" in str(error) else ""
+            raise ValueError(f"An env failed {where} ({error}){shape}.") from error
         except (EOFError, ConnectionError) as error:
             raise RuntimeError(
                 f"The process of an env died {where}: its own traceback is printed above. Envs in one process (vec_env dummy) "
@@ -429,7 +433,7 @@ class OffPolicyMetaAlgorithm(SAC):
             super().save(temporary, exclude, include)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "knowledge", "task_bank", "_pending_random"]
+        return [*super()._excluded_save_params(), "knowledge", "task_bank", "_pending_random", "update_listeners"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()
@@ -460,9 +464,13 @@ class OffPolicyMetaAlgorithm(SAC):
             )
         file: Any = path if isinstance(path, io.IOBase) else _with_suffix(path, ".pt")
         try:
+            # torch writes a zip file, and does not look at its checksums
+            with zipfile.ZipFile(file) as archive:
+                if archive.testzip() is not None:
+                    raise EOFError
             state = th.load(file, weights_only=True)
             replay, task_bank = state["replay"], state["task_bank"]
-        except (RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError):
+        except (RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError, zipfile.BadZipFile):
             raise ValueError(
                 f"{path} is damaged, or no replay buffer of sb3_htr: pass a file that save_replay_buffer has written."
             ) from None

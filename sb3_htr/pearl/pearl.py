@@ -112,6 +112,8 @@ class PEARL(OffPolicyMetaAlgorithm):
             gamma=(gamma, 0.0, 1.0),
             tau=(tau, 0.0, 1.0),
         )
+        if tau == 0:
+            raise ValueError("tau is 0, with which the target critics would never learn: expected a number above 0, up to 1.")
         if matmul_precision not in PRECISIONS:
             raise ValueError(f"matmul_precision is {matmul_precision!r}, expected one of {list(PRECISIONS)}.")
         super().__init__(
@@ -232,6 +234,8 @@ class PEARL(OffPolicyMetaAlgorithm):
             "rl_reward_mean": (data.rewards * weight).sum(),
             "rl_zero_reward_fraction": th.tensor(data.unrewarded.mean()),
         }
+        for listener in self.update_listeners:
+            listener()
         return mean.detach(), log
 
     def _excluded_save_params(self) -> list[str]:

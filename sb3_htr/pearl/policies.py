@@ -121,7 +121,7 @@ class PEARLPolicy(SACPolicy):
     @property
     def device(self) -> th.device:
         """Where the networks are. SB3 looks for it among all parameters, which takes longer than to act."""
-        return cast(nn.Linear, self.actor.mu).weight.device if hasattr(self, "actor") else super().device
+        return cast(nn.Linear, self.actor.mu).weight.device if hasattr(self, "actor") else th.get_default_device()
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)

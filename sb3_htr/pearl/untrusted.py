@@ -1,32 +1,32 @@
 """Models of unknown origin."""
 
-import inspect
 import io
 import json
 import os
-import pickle
 import zipfile
 from typing import Any
 
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.type_aliases import GymEnv
 
+from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.pearl.pearl import PEARL
+from sb3_htr.pearl.policies import PEARLPolicy
 
-# Arguments of PEARL that a file of unknown origin may set: numbers and names, no classes
-POLICY_KWARGS = ("latent_dim", "net_arch", "encoder_arch", "normalize_observations")
+# What a file may unpack to, and how large its networks may be
+MAX_BYTES, MAX_LAYERS, MAX_UNITS = 2**30, 16, 2**14
 EXPLORERS = ("explorer", "train_explorer")
 
 
-def load_untrusted(
-    path: str | os.PathLike[str], env: GymEnv | str, device: th.device | str = "auto", **kwargs: Any
-) -> "PEARL":
+def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.device | str = "auto", **kwargs: Any) -> PEARL:
     """
-    Load a model of unknown origin: weights and plain settings, without running code of the file.
+    Load a model of unknown origin: weights and plain settings, without running code of the file, and in as much memory as its
+    weights take.
 
-    SB3's ``load`` unpickles what is no plain JSON in the file, and a pickle can run anything. This function reads the numbers
-    and names among the settings, makes a new model with them and fills in the weights. Schedules, classes and optimizers are
-    left out.
+    SB3's ``load`` unpickles what is no plain JSON in the file, and a pickle can run anything. This function reads the sizes of
+    the networks, the explorers and their settings, and the size of a context; it makes a new model with them and fills in the
+    weights. What only training needs is left at its defaults.
 
     :param path: file of ``PEARL.save``
     :param env: env of the same spaces; its spaces are not read from the file
@@ -36,29 +36,70 @@ def load_untrusted(
     :raises ValueError: if it is no such file, or its weights do not fit
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            data = json.loads(archive.read("data"))
-            weights, knowledge = (
-                th.load(io.BytesIO(archive.read(f"{name}.pth")), map_location="cpu", weights_only=True)
-                for name in ("policy", "knowledge")
-            )
-    except (zipfile.BadZipFile, KeyError, ValueError, RuntimeError, pickle.UnpicklingError):
-        raise ValueError(f"{path} is damaged, or no model saved by PEARL: nothing of it was loaded.") from None
-    arguments = set(inspect.signature(PEARL.__init__).parameters) - {"policy", "env", "device", "tensorboard_log"}
-    settings = {name: data[name] for name in arguments & data.keys() if isinstance(data[name], int | float | str)}
-    # Of an object, SB3 writes its plain attributes beside the pickle
-    for name in EXPLORERS:
-        explorer = data.get(name)
-        plain = isinstance(explorer, dict)
-        settings[name] = {key: explorer[key] for key in explorer if not key.startswith(":")} if plain else explorer
-    given = data.get("policy_kwargs", {})
-    settings["policy_kwargs"] = {name: given[name] for name in POLICY_KWARGS if name in given}
+        data, weights = _read(path)
+        settings: dict[str, Any] = {name: _plain(data[name]) for name in EXPLORERS}
+        settings["context_size"] = int(data["context_size"])
+        settings["policy_kwargs"] = _policy_kwargs(data.get("policy_kwargs", {}))
+    except Exception as error:  # whatever a stranger can put into a file
+        why = f": {error}" if isinstance(error, ValueError) and "PEARL" in str(error) else "."
+        raise ValueError(f"{path} is damaged, or no model saved by PEARL: nothing of it was loaded{why}") from None
+    if isinstance(env, str):
+        env = make_task_vec_env(env)
+    _check_shapes(path, weights["policy"], env, {**settings["policy_kwargs"], **kwargs.get("policy_kwargs", {})})
     model = PEARL("MlpPolicy", env, device=device, **{**settings, **kwargs})
     try:
-        model.policy.load_state_dict(weights)
-        model.knowledge.load_state_dict(knowledge)
-    except RuntimeError as error:
-        raise ValueError(
-            f"The weights in {path} do not fit the env or the settings: {str(error).splitlines()[1].strip()}"
-        ) from None
+        model.policy.load_state_dict(weights["policy"])
+        model.knowledge.load_state_dict(weights["knowledge"])
+    except (RuntimeError, TypeError, AttributeError) as error:
+        raise ValueError(f"The weights in {path} do not fit the env or the settings: {_last_line(error)}") from None
     return model
+
+
+def _read(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+    with zipfile.ZipFile(path) as archive:
+        if sum(info.file_size for info in archive.infolist()) > MAX_BYTES:
+            raise ValueError(f"PEARL's files do not unpack to more than {MAX_BYTES} bytes.")
+        data = json.loads(archive.read("data"))
+        weights = {
+            name: th.load(io.BytesIO(archive.read(f"{name}.pth")), map_location="cpu", weights_only=True)
+            for name in ("policy", "knowledge")
+        }
+    if not all(isinstance(value, dict) for value in (data, *weights.values())):
+        raise TypeError
+    return data, weights
+
+
+def _plain(explorer: dict[str, Any]) -> dict[str, Any]:
+    """Of an object, SB3 writes its plain attributes beside the pickle."""
+    return {key: value for key, value in explorer.items() if not key.startswith(":")}
+
+
+def _policy_kwargs(given: dict[str, Any]) -> dict[str, Any]:
+    unknown = [name for name in given if name not in ("latent_dim", "net_arch", "encoder_arch", "normalize_observations")]
+    if any(not name.startswith(":") for name in unknown):
+        raise ValueError(
+            f"its policy has the setting {unknown[0]!r}, which only PEARL.load restores, and that may run code of the file."
+        )
+    kwargs = {name: value for name, value in given.items() if name not in unknown}
+    for units in (kwargs.get("net_arch", []), kwargs.get("encoder_arch", []), [kwargs.get("latent_dim", 1)]):
+        if len(units) > MAX_LAYERS or not all(type(unit) is int and 1 <= unit <= MAX_UNITS for unit in units):
+            raise ValueError(f"PEARL's networks do not have layers of {units} units.")
+    return {**kwargs, "normalize_observations": bool(kwargs.get("normalize_observations", False))}
+
+
+def _check_shapes(path: str | os.PathLike[str], weights: dict[str, Any], env: GymEnv, policy_kwargs: dict[str, Any]) -> None:
+    """Without memory for the weights."""
+    assert isinstance(env.observation_space, spaces.Box) and isinstance(env.action_space, spaces.Box)
+    with th.device("meta"):
+        expected = PEARLPolicy(env.observation_space, env.action_space, lambda _: 0.0, **policy_kwargs).state_dict()
+    for name in {**expected, **weights}:
+        here, there = (getattr(tensors.get(name), "shape", None) for tensors in (expected, weights))
+        if here != there:
+            raise ValueError(
+                f"The weights in {path} do not fit the env or the settings: {name} has shape {there and tuple(there)}, "
+                f"expected {here and tuple(here)}."
+            )
+
+
+def _last_line(error: Exception) -> str:
+    return (str(error).splitlines() or [""])[-1].strip()[:200]

@@ -82,14 +82,10 @@ class EpisodeClustering(Relabeller):
         self.hindsight_task_strategy = HindsightTaskStrategy.of(hindsight_task_strategy)
 
     def bind(self, buffer: "MultiTaskReplayBuffer") -> None:
-        """
-        :param buffer: whose episodes are relabelled
-        """
         super().bind(buffer)
         self.reset()
 
     def reset(self) -> None:
-        """Forget all episodes."""
         own = self.buffer.episodes
         self.episodes = EpisodeStore(0, own.episodes_per_task, own.episode_length, self.buffer.transitions.width)
         self._tasks: list[np.ndarray] = []
@@ -120,9 +116,6 @@ class EpisodeClustering(Relabeller):
         return float((np.add.reduceat(task_part, index.episode_row[:-1]) > 0).mean())
 
     def stats(self) -> dict[str, float]:
-        """
-        :return: balance of rewarded episodes, number and memory of the hindsight buffers
-        """
         real, hindsight = self.rewarded_fraction()
         return {
             "replay/rewarded_fraction_real": real,
@@ -132,37 +125,27 @@ class EpisodeClustering(Relabeller):
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """
-        :return: the hindsight buffers and their tasks
-        """
         return {"episodes": self.episodes.state_dict(), "tasks": th.from_numpy(np.array(self._tasks, dtype=np.float32))}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """
-        :param state: of :meth:`state_dict`
-        """
         self.episodes.load_state_dict(state["episodes"])
         self._tasks = list(state["tasks"].numpy().copy())
         self._buffer_of = {task.tobytes(): i for i, task in enumerate(self._tasks)}
 
     def on_episode(self, task: int, episode: np.ndarray) -> None:
-        """
-        Put copies of the episode into hindsight buffers.
-
-        :param task: not used
-        :param episode: (length, width) float32
-        """
         buffer, strategy = self.buffer, self.hindsight_task_strategy
         rng = buffer.relabel_rng
         steps = strategy.steps(np.full(strategy.n_candidates, len(episode)), rng)
         reached = buffer.task_family.hindsight_task(buffer.transitions.trajectory(episode), steps)
         representatives = self.discretiser(reached)
         count = np.array([1 + self._n_episodes_of(representative) for representative in representatives])
-        self._add(representatives[strategy.choose(count[None], rng)[0]], episode)
-        # As many exploratory episodes as make up their share: this one, under a task that others reached
+        reached_task = representatives[strategy.choose(count[None], rng)[0]]
+        self._add(reached_task, episode)
+        # As many exploratory episodes as make up their share: this one, under tasks that others reached, each once
         n_exploratory = self.exploratory_fraction / (1 - self.exploratory_fraction)
-        for _ in range(int(n_exploratory + rng.random())):
-            self._add(self._tasks[rng.integers(self.n_hindsight_buffers)], episode)
+        others = np.delete(np.arange(self.n_hindsight_buffers), self._buffer_of[reached_task.tobytes()])
+        for other in rng.permutation(others)[: int(n_exploratory + rng.random())]:
+            self._add(self._tasks[other], episode)
 
     def _n_episodes_of(self, hindsight_task: np.ndarray) -> int:
         buffer = self._buffer_of.get(hindsight_task.tobytes())
@@ -179,10 +162,6 @@ class EpisodeClustering(Relabeller):
         self.episodes.add(self._buffer_of[key], relabelled)
 
     def draw(self, tasks: np.ndarray) -> HindsightDraw:
-        """
-        :param tasks: (m,) int, training tasks
-        :return: a random hindsight buffer in place of each of them
-        """
         chosen = self.buffer.relabel_rng.integers(self.n_hindsight_buffers, size=len(tasks))
         index = self.episodes.index()
         context = index.latest_episodes(chosen, self.buffer.context_episodes)

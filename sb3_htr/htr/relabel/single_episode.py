@@ -33,10 +33,6 @@ class SingleEpisodeRelabelling(Relabeller):
         self.rl_batch_source = rl_batch_source
 
     def draw(self, tasks: np.ndarray) -> HindsightDraw:
-        """
-        :param tasks: (m,) int, training tasks
-        :return: for each one episode of its replay and a task that the episode reached
-        """
         buffer, strategy = self.buffer, self.hindsight_task_strategy
         rng, index = buffer.relabel_rng, buffer.episodes.index()
         first, end = index.task_episode[tasks, None], index.task_episode[tasks + 1, None]

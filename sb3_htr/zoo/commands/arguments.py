@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from sb3_htr.adaptation.explorers import EXPLORERS
-from sb3_htr.zoo.run.agents import TrainedAgent, agent_at, agent_for, import_packages
+from sb3_htr.zoo.run.agents import TrainedAgent, agent_at, agent_for
+from sb3_htr.zoo.run.trust import import_packages, refuse
 
 TASK_SETS = ("test", "validation", "train")
 
@@ -64,6 +65,7 @@ def add_agent_arguments(parser: argparse.ArgumentParser, several: bool = False) 
     group.add_argument(
         "--env-kwargs", nargs="+", action=KeyValues, default={}, metavar="KEY:VALUE", help="change arguments of the env"
     )
+    group.add_argument("--trust", action="store_true", help="let the files of the agent import and unpickle what they name")
     group.add_argument("--device", default="cpu", help="torch device (default: cpu)")
 
 
@@ -100,7 +102,9 @@ def chosen_agent(parser: argparse.ArgumentParser, args: argparse.Namespace, path
         agent = agent_for(args.env, args.folder, args.method, args.exp_id, args.model)
     else:
         parser.error("say which agent: a run folder or model file, or --env ID")
-    import_packages(agent.record["gym_packages"])
+    if ":" in agent.env_id and not args.trust:
+        raise refuse(agent.path, f"is for the env {agent.env_id!r}")
+    import_packages(args.gym_packages, agent.record["gym_packages"], agent.path, args.trust)
     kwargs = {**agent.record["env_kwargs"], **args.env_kwargs}
     return dataclasses.replace(agent, record={**agent.record, "env_kwargs": kwargs})
 

@@ -46,7 +46,7 @@ def watch(agent: TrainedAgent, args: argparse.Namespace, every: int, show: Show)
     :return: last moment of each task
     :raises ValueError: for a task or a number of episodes that there is not
     """
-    model = agent.load(args.device)
+    model = agent.load(args.device, args.trust)
     env = agent.make_env("rgb_array" if every else None)
     player = Player(model, env, args.explorer, not args.stochastic, args.seed, every)
     tasks: np.ndarray = getattr(get_task_family(player.vec_env), f"{args.tasks}_tasks")
@@ -90,9 +90,7 @@ def can_be_drawn(agent: TrainedAgent) -> bool:
 
 
 def main(argv: Sequence[str]) -> None:
-    """
-    :param argv: arguments of the command
-    """
+    """The command, with its arguments."""
     parser = make_parser("enjoy", "Watch a trained agent adapt to tasks that it has not seen, one after the other.", EXAMPLE)
     add_agent_arguments(parser)
     add_task_arguments(parser)

@@ -33,15 +33,13 @@ def table(record: AdaptationRecord) -> str:
 
 
 def main(argv: Sequence[str]) -> None:
-    """
-    :param argv: arguments of the command
-    """
+    """The command, with its arguments."""
     parser = make_parser("evaluate", "Adapt a trained agent to unseen tasks: a table, pictures and the data.", EXAMPLE)
     add_agent_arguments(parser)
     add_adaptation_arguments(parser, n_episodes=20)
     parser.add_argument("-o", "--output", type=Path, help="folder for the files (default: the run folder, or ./ENV_ID)")
     args, agent = parse(parser, argv)
-    model = agent.load(args.device)
+    model = agent.load(args.device, args.trust)
     env = agent.make_vec_env(20)
     family = get_task_family(env)
     tasks = getattr(family, f"{args.tasks}_tasks")

@@ -11,9 +11,7 @@ EXAMPLE = """  sb3-htr experiment point_robot --jobs 2
 
 
 def main(argv: Sequence[str]) -> None:
-    """
-    :param argv: arguments of the command
-    """
+    """The command, with its arguments."""
     # Experiments use the zoo, and not the other way round
     grid, report = (importlib.import_module(f"sb3_htr.experiments.{name}") for name in ("grid", "report"))
     names = "\n".join(f"  {name:<14} {experiment.env_id}: {experiment.about}" for name, experiment in grid.EXPERIMENTS.items())

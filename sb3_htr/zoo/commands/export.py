@@ -25,7 +25,7 @@ ALSO_KEPT = ("observation_space", "action_space", "policy_class", "n_envs", "num
 KEPT_OF_RECORD = ("env_id", "method", "env_kwargs", "gym_packages", "seed", "n_timesteps", "hyperparams", "versions")
 
 
-def export(agent: TrainedAgent, path: Path) -> dict[str, Any]:
+def export(agent: TrainedAgent, path: Path, trust: bool = False) -> dict[str, Any]:
     """
     Write a model file without optimizer states, replay, statistics of training and local paths. ``PEARL.load`` reads it, and
     the commands find in it which env it is for. Actor and encoder are exact; the critics, which acting does not need, are kept
@@ -33,9 +33,10 @@ def export(agent: TrainedAgent, path: Path) -> dict[str, Any]:
 
     :param agent: to export
     :param path: file to write
+    :param trust: see :meth:`TrainedAgent.load`
     :return: its record
     """
-    model = agent.load()
+    model = agent.load(trust=trust)
     for name in model._get_torch_save_params()[0]:
         if name.endswith("optimizer"):
             attrgetter(name)(model).state.clear()
@@ -85,9 +86,7 @@ def push_to_hub(folder: Path, repo_id: str, private: bool = False) -> str:
 
 
 def main(argv: Sequence[str]) -> None:
-    """
-    :param argv: arguments of the command
-    """
+    """The command, with its arguments."""
     description = "Write an agent as a small model file with a model card: scores after adaptation, how to load it."
     parser = make_parser("export", description, EXAMPLE)
     add_agent_arguments(parser)
@@ -102,7 +101,7 @@ def main(argv: Sequence[str]) -> None:
     if alone and (args.push_to_hub or args.film):
         raise ValueError(f"--push-to-hub and --film need a folder, but the output is the file {output}.")
     file = output if alone else output / f"{agent.env_id}.zip"
-    record = export(agent, file)
+    record = export(agent, file, args.trust)
     print(f"{file}: {file.stat().st_size / 1e6:.2f} MB, of {agent.path}")
     if alone:
         return

@@ -56,7 +56,7 @@ def adapt(agent: TrainedAgent, args: argparse.Namespace) -> Adapted:
     :return: what happened
     """
     print(f"Adapting {agent.path}")
-    model = agent.load(args.device)
+    model = agent.load(args.device, args.trust)
     family = get_task_family(agent.make_vec_env(1))
     tasks: np.ndarray = getattr(family, f"{args.tasks}_tasks")
     env = agent.make_vec_env(len(tasks))
@@ -138,9 +138,7 @@ def learning_curve(label: str, agents: Sequence[TrainedAgent]) -> Curve | None:
 
 
 def main(argv: Sequence[str]) -> None:
-    """
-    :param argv: arguments of the command
-    """
+    """The command, with its arguments."""
     description = "Pictures of one or several runs: learning curves, return per adaptation episode, paths, latent space."
     parser = make_parser("plot", description, EXAMPLE)
     add_agent_arguments(parser, several=True)

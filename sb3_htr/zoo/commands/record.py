@@ -18,9 +18,7 @@ EPISODE_END, TASK_END = 0.4, 1.2
 
 
 def main(argv: Sequence[str]) -> None:
-    """
-    :param argv: arguments of the command
-    """
+    """The command, with its arguments."""
     parser = make_parser("record", "Film a trained agent that adapts to tasks that it has not seen; needs no screen.", EXAMPLE)
     add_agent_arguments(parser)
     add_task_arguments(parser)

@@ -1,16 +1,19 @@
 """``sb3-htr train``: rl_zoo3's training with PEARL in it, and with evaluations that adapt."""
 
 import argparse
-import json
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
-from sb3_htr.zoo.run.agents import find_run
+from sb3_htr.common.resume import n_steps_done
+from sb3_htr.zoo.run.agents import RECORD, find_run, read_record
 from sb3_htr.zoo.run.manager import run_rl_zoo
 from sb3_htr.zoo.run.memory import keep_freed_memory
 from sb3_htr.zoo.run.method import get_method
 from sb3_htr.zoo.run.shipped import hyperparams_file
+from sb3_htr.zoo.run.trust import check_arguments, import_packages
 
+CONF = ("-conf", "--conf-file")
 HELP = """sb3-htr train: rl_zoo3's train (its arguments follow) with PEARL and evaluations that adapt to validation tasks.
 
 examples:
@@ -22,7 +25,9 @@ examples:
 defaults here: --algo pearl -conf hyperparams/pearl.yml (of this package) --num-threads 1 --save-freq 20000
 beside rl_zoo3's:
   --method NAME  htr-ser (default), htr-ec, pearl-dense, pearl-sparse; with -prior behind it under PEARL's own protocol
-  --resume RUN   go on with a run from its latest checkpoint, exactly; takes no other arguments
+  --resume RUN   go on with a run from its latest checkpoint, exactly; takes no other arguments but those below
+                 and -n STEPS: so many more than planned; a learning rate that decays does so anew over what is then planned
+  --trust        let files (YAML, the record of a run) import and evaluate what they name
 no effect here: --eval-episodes and --n-eval-envs (an evaluation adapts to each validation task once, in 20 episodes)
 """
 
@@ -35,6 +40,8 @@ def main(argv: Sequence[str]) -> None:
     parser = argparse.ArgumentParser(prog="sb3-htr train", add_help=False, allow_abbrev=False)
     parser.add_argument("--resume", type=Path)
     parser.add_argument("--method")
+    parser.add_argument("--trust", action="store_true")
+    parser.add_argument("--gym-packages", nargs="+", default=[])
     parser.add_argument("--algo", default="pearl")
     args, rest = parser.parse_known_args(argv)
     wants_help = bool({"-h", "--help"} & set(rest))
@@ -46,21 +53,35 @@ def main(argv: Sequence[str]) -> None:
         get_method(args.method)
     run: Path | None = None
     if args.resume is not None:
+        more = argparse.ArgumentParser(prog="sb3-htr train --resume", add_help=False, allow_abbrev=False)
+        more.add_argument("-n", "--n-timesteps", type=int, default=0)
+        further, rest = more.parse_known_args(rest)
         if rest or args.method:
             given = " ".join(rest) or "--method"
             raise ValueError(f"train --resume goes on with the run's own arguments: leave {given} away.")
         run = find_run(args.resume)
-        record = json.loads((run / "run.json").read_text())
+        record = read_record(run / RECORD)
+        planned = record["n_timesteps"] + further.n_timesteps
+        if n_steps_done(run) >= planned and (run / f"{record['env_id']}.zip").exists():
+            print(f"{run} is finished, after {planned:,} env steps. To train further: sb3-htr train --resume {run} -n STEPS")
+            return
         arguments, args.method = [*record["arguments"], "--seed", str(record["seed"])], record["method"]
+        arguments += ["-n", str(planned)]
+        check_arguments(arguments, run / RECORD, args.trust)
+        import_packages(args.gym_packages, record["gym_packages"], run / RECORD, args.trust)
     else:
         if not wants_help and not any(argument.split("=")[0] == "--env" for argument in rest):
             raise ValueError("--env is missing: give the id of a task env, as in `sb3-htr train --env SparsePointRobot-v0`.")
         # Later arguments win, so these are defaults. One thread: two runs on two cores must not fight for them.
         defaults = ["--algo", "pearl", "-conf", str(hyperparams_file()), "--num-threads", "1", "--save-freq", "20000"]
-        arguments = [*defaults, *rest]
+        packages = ["--gym-packages", *args.gym_packages] if args.gym_packages else []
+        for before, word in list(pairwise(rest)):
+            if before in CONF and Path(word).exists():
+                rest[rest.index(word)] = str(Path(word).resolve())  # wherever the run goes on from
+        arguments = [*defaults, *rest, *packages]
     keep_freed_memory()
     try:
-        run_rl_zoo("sb3-htr train", arguments, args.method, run)
+        run_rl_zoo("sb3-htr train", arguments, args.method, run, args.trust)
     except (NameError, SyntaxError) as error:
         raise ValueError(
             f"{error}: the values of -params and --env-kwargs are Python, with strings in quotes, as in \"explorer:'prior'\"."

@@ -1,14 +1,12 @@
 """Trained agents: where they are, and the env that each was trained on."""
 
 import contextlib
-import importlib
 import json
 import os
 import zipfile
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import torch as th
@@ -16,7 +14,7 @@ from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv
 
 import htr_envs  # noqa: F401 registers the envs
-from sb3_htr import PEARL
+from sb3_htr import PEARL, load_untrusted
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.zoo.run.method import get_method, methods
 from sb3_htr.zoo.run.shipped import shipped
@@ -52,9 +50,11 @@ class TrainedAgent:
         """How a picture calls it: the run folder or the file."""
         return self.folder.name if self.folder is not None else f"{self.path.parent.name}/{self.path.stem}"
 
-    def load(self, device: str = "cpu") -> PEARL:
+    def load(self, device: str = "cpu", trust: bool = False) -> PEARL:
         """
         :param device: torch device
+        :param trust: unpickle all of the file, as ``PEARL.load`` does, which can run any code; needed for networks and
+            explorers of one's own
         :return: the model
         :raises ValueError: for a device that cannot be used, or a model whose networks are not those of this version
         """
@@ -63,7 +63,9 @@ class TrainedAgent:
         except (RuntimeError, AssertionError, NotImplementedError):
             raise ValueError(f"The device {device!r} cannot be used: give cpu, cuda or cuda:N.") from None
         try:
-            return PEARL.load(self.path, device=device)
+            if trust:
+                return PEARL.load(self.path, device=device)
+            return load_untrusted(self.path, self.make_env(), device)
         except RuntimeError as error:
             writer = self.record.get("versions", {}).get("sb3_htr", "unknown")
             reason = str(error).splitlines()[-1].strip()[:200]
@@ -94,6 +96,23 @@ class TrainedAgent:
         :return: the envs
         """
         return make_task_vec_env(self.env_id, n_envs, env_kwargs=self.record["env_kwargs"])
+
+
+def read_record(path: Path, content: bytes | None = None) -> dict[str, Any]:
+    """
+    :param path: of the record, or of the file that it is in
+    :param content: if it was read already
+    :return: the record of a run
+    :raises ValueError: if it is damaged
+    """
+    try:
+        record = json.loads(path.read_bytes() if content is None else content)
+        texts = record["env_id"], *record["gym_packages"]
+        if isinstance(record["env_kwargs"], dict) and all(isinstance(text, str) for text in texts):
+            return cast(dict[str, Any], record)
+    except (ValueError, KeyError, TypeError, RecursionError):
+        pass
+    raise ValueError(f"{path} is damaged, or no record of a run: it must say env_id, env_kwargs and gym_packages.")
 
 
 def find_runs(folder: Path) -> list[Path]:
@@ -149,7 +168,7 @@ def agent_at(path: str | os.PathLike[str], which: str = "best", env_id: str | No
         path = files[0]
     if path.is_dir():
         run = find_run(path)
-        record = json.loads((run / RECORD).read_text())
+        record = read_record(run / RECORD)
         return TrainedAgent(find_model(run, record["env_id"], which), record, run)
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist: give a run folder, a folder of runs, or a model file (.zip).")
@@ -157,11 +176,11 @@ def agent_at(path: str | os.PathLike[str], which: str = "best", env_id: str | No
     with contextlib.suppress(zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
         names = archive.namelist()
         if RECORD in names:
-            return TrainedAgent(path, json.loads(archive.read(RECORD)), None)
+            return TrainedAgent(path, read_record(path, archive.read(RECORD)), None)
     if "data" not in names:
         raise ValueError(f"{path} is no model file: give a run folder, or a .zip saved by PEARL.")
     if (path.parent / RECORD).exists():
-        return TrainedAgent(path, json.loads((path.parent / RECORD).read_text()), path.parent)
+        return TrainedAgent(path, read_record(path.parent / RECORD), path.parent)
     if env_id is None:
         raise ValueError(f"{path} does not say which env it was trained on: add --env ID.")
     return TrainedAgent(path, {"env_id": env_id, "env_kwargs": {}, "gym_packages": []}, None)
@@ -207,19 +226,3 @@ def _number(run: Path, env_id: str) -> int:
     """Of a run folder, rl_zoo3's ``<env_id>_<number>``, or with a unique id behind it; 0 for another folder."""
     number = run.name.removeprefix(f"{env_id}_").split("_")[0]
     return int(number) if number.isdigit() else 0
-
-
-def import_packages(names: Sequence[str]) -> None:
-    """
-    :param names: modules that register envs
-    :raises ValueError: for one that is not there
-    """
-    for name in names:
-        try:
-            importlib.import_module(name)
-        except ModuleNotFoundError as error:
-            if error.name != name.split(".")[0]:
-                raise
-            raise ValueError(
-                f"The env needs the module {name}, which is not found: install it, or add its folder to PYTHONPATH."
-            ) from None

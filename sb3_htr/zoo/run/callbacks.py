@@ -1,13 +1,30 @@
 """Callbacks that only runs of the command line need."""
 
+import contextlib
 import os
-from pathlib import Path
-from typing import Any, Protocol
+import warnings
+from typing import Any
 
+import optuna
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import CSVOutputFormat
 
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
+from sb3_htr.common.atomic import reason
+
+
+class PatientCSV(CSVOutputFormat):
+    """Writes as long as that is possible: a disk that is full stops no training."""
+
+    def write(self, *args: Any, **kwargs: Any) -> None:
+        try:
+            super().write(*args, **kwargs)
+        except OSError as error:
+            warnings.warn(f"{self.file.name} could not be written ({reason(error)}). Training goes on.")
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):  # what could not be written before
+            super().close()
 
 
 class ProgressCallback(BaseCallback):
@@ -26,7 +43,13 @@ class ProgressCallback(BaseCallback):
         """
         :return: what was written so far
         """
-        return {"keys": list(self._output.keys), "text": Path(self.path).read_text()}
+        # Not by its name: somebody may have removed it
+        self._output.file.seek(0)
+        self._written = {"keys": list(self._output.keys), "text": self._output.file.read()}
+        if not os.path.exists(self.path):
+            self._end()
+            self._begin()
+        return self._written
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """
@@ -34,33 +57,27 @@ class ProgressCallback(BaseCallback):
         """
         self._written = state
 
-    def _on_training_start(self) -> None:
-        self._output = CSVOutputFormat(self.path)
+    def _begin(self) -> None:
+        self._output = PatientCSV(self.path)
         self._output.keys = list(self._written["keys"])
         self._output.file.write(self._written["text"])
         self._output.file.flush()
         self.logger.output_formats.append(self._output)
 
-    def _on_step(self) -> bool:
-        return True
-
-    def _on_training_end(self) -> None:
+    def _end(self) -> None:
         # rl_zoo3 may end the training of a callback a second time
         if self._output in self.logger.output_formats:
             self.logger.output_formats.remove(self._output)
             self._output.close()
 
+    def _on_training_start(self) -> None:
+        self._begin()
 
-class TrialResult(Protocol):
-    """The part of an Optuna trial that :class:`MetaTrialEvalCallback` uses."""
+    def _on_step(self) -> bool:
+        return True
 
-    def report(self, value: float, step: int) -> None:
-        """Report an intermediate value."""
-        ...
-
-    def should_prune(self) -> bool:
-        """Whether the trial is hopeless."""
-        ...
+    def _on_training_end(self) -> None:
+        self._end()
 
 
 class MetaTrialEvalCallback(MetaEvalCallback):
@@ -72,7 +89,7 @@ class MetaTrialEvalCallback(MetaEvalCallback):
     :param kwargs: as for :class:`MetaEvalCallback`
     """
 
-    def __init__(self, eval_env: Any, trial: TrialResult, **kwargs: Any) -> None:
+    def __init__(self, eval_env: Any, trial: optuna.Trial, **kwargs: Any) -> None:
         super().__init__(eval_env, **{"verbose": 0, **kwargs})
         self.trial = trial
         self.eval_idx = 0

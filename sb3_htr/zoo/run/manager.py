@@ -2,7 +2,6 @@
 
 import importlib
 import json
-import os
 import signal
 import sys
 import threading
@@ -18,30 +17,32 @@ from pprint import pprint
 from types import ModuleType
 from typing import Any
 
-import gymnasium as gym
 import optuna
 import rl_zoo3.train
 from rl_zoo3 import exp_manager
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
-from rl_zoo3.utils import ALGOS, SimpleLinearSchedule, get_latest_run_id
+from rl_zoo3.utils import ALGOS, SimpleLinearSchedule
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import LinearSchedule
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr import PEARL
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
-from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.atomic import WRITE_ERRORS, atomic_path, reason
 from sb3_htr.common.checks import check_keywords, check_numbers
+from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.resume import CheckpointCallback, checkpoints, cut_monitor_files, load_latest
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.pearl.divergence import DivergedError
+from sb3_htr.zoo.run.agents import RECORD, read_record
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback, ProgressCallback
+from sb3_htr.zoo.run.folder import claim, lock
 from sb3_htr.zoo.run.method import DEFAULT, get_method, merged
 from sb3_htr.zoo.run.search_space import convert_pearl_params, sample_pearl_params
-from sb3_htr.zoo.run.yaml_values import without_code
+from sb3_htr.zoo.run.trust import plain_settings
 
 PACKAGES = ("sb3_htr", "stable_baselines3", "gymnasium", "rl_zoo3", "torch", "numpy", "mujoco")
 # What a YAML file may have beside the arguments of PEARL
@@ -55,8 +56,11 @@ class MetaExperimentManager(ExperimentManager):
     rl_zoo3's manager, with task envs stepped as one batch and env arguments of the YAML that reach the evaluation too.
     """
 
-    def __init__(self, *args: Any, method: str | None = None, resumed: Path | None = None, **kwargs: Any) -> None:
+    def __init__(
+        self, *args: Any, method: str | None = None, resumed: Path | None = None, trust: bool = False, **kwargs: Any
+    ) -> None:
         super().__init__(*args, **kwargs)
+        self.trust = trust
         self._method_name = method
         self._unique = kwargs.get("uuid_str", "")
         self.resumed = resumed
@@ -77,7 +81,7 @@ class MetaExperimentManager(ExperimentManager):
         in_file = hyperparams.pop("method", DEFAULT)
         in_params = given.pop("method", in_file)
         self.method = get_method(self._method_name or in_params)
-        hyperparams = merged(without_code(hyperparams), self.method.hyperparams())
+        hyperparams = merged(plain_settings(hyperparams, self.config, self.trust), self.method.hyperparams())
         hyperparams = merged(merged(hyperparams, self._trial(trial_id)), given)
         saved = OrderedDict(sorted(hyperparams.items()))
         print(f"Method {self.method.name}: {self.config} has the settings of the env. With those of the command line:")
@@ -125,19 +129,18 @@ class MetaExperimentManager(ExperimentManager):
         :param n_envs: number of envs
         :param eval_env: whether the envs are for evaluation
         :param no_log: write no monitor file
-        :return: the envs, batched if the registration offers that and no wrapper of single envs is asked for
+        :return: the envs
         """
-        spec = gym.spec(self.env_name.gym_id)
         # A search makes envs for a look at their spaces too, which is no run to be logged
-        no_log = no_log or self.optimize_hyperparameters
-        if spec.vector_entry_point is None or self.env_wrapper is not None or self.args.vec_env == "subproc":
-            return super().create_envs(n_envs, eval_env, no_log)
+        no_log = no_log or self.optimize_hyperparameters or eval_env
         env = make_task_vec_env(
             self.env_name.gym_id,
             N_EVAL_ENVS if eval_env else n_envs,
             seed=self.seed,
-            monitor_dir=None if eval_env or no_log else self.save_path,
+            monitor_dir=None if no_log else self.save_path,
             env_kwargs=self.eval_env_kwargs if eval_env else self.env_kwargs,
+            wrapper=self.env_wrapper,
+            vec_env_class=SubprocVecEnv if self.args.vec_env == "subproc" else None,
         )
         return env if self.vec_env_wrapper is None else self.vec_env_wrapper(env)
 
@@ -149,10 +152,13 @@ class MetaExperimentManager(ExperimentManager):
         if self.tensorboard_log:
             importlib.import_module("tensorboard")  # missing, it should be said before anything is written
         if self.resumed is None:
-            number = get_latest_run_id(self.log_path, self.env_name) + 1
-            self.save_path = os.path.join(self.log_path, f"{self.env_name}_{number}{self._unique}")
+            # An env that cannot be trained on should say so before there is a folder
+            make_task_vec_env(self.env_name.gym_id, env_kwargs=self.env_kwargs, wrapper=self.env_wrapper).close()
+            self.save_path = str(claim(self.log_path, self.env_name, self._unique))
+            self._lock = lock(Path(self.save_path))
         else:
             self.save_path = str(self.resumed)
+            self._lock = lock(self.resumed)
             folder, self._checkpoint = load_latest(self.resumed)
             cut_monitor_files(self.resumed, folder, self._checkpoint["monitor_files"])
             print(f"Going on from {folder}")
@@ -195,6 +201,20 @@ class MetaExperimentManager(ExperimentManager):
                     print(f"To go on: sb3-htr train --resume {self.save_path}")
                 assert model.env is not None
                 model.env.close()
+                self._lock.release()
+
+    def save_trained_model(self, model: BaseAlgorithm) -> None:
+        """
+        :param model: at the end of its training
+        :raises OSError: if it cannot be written
+        """
+        try:
+            super().save_trained_model(model)
+        except WRITE_ERRORS as error:
+            raise OSError(
+                f"The last model could not be written to {self.save_path} ({reason(error)}): free some space, and "
+                f"`sb3-htr train --resume {self.save_path}` goes on from the last checkpoint."
+            ) from error
 
     def objective(self, trial: optuna.Trial) -> float:
         """
@@ -214,8 +234,11 @@ class MetaExperimentManager(ExperimentManager):
         # As used: -n may have replaced the file's
         used = {**saved_hyperparams, "n_timesteps": self.n_timesteps}
         if self.resumed is not None:
-            before = json.loads((self.resumed / "run.json").read_text())["hyperparams"]
-            now = json.loads(json.dumps(used))
+            record = read_record(self.resumed / RECORD)
+            before, now = record["hyperparams"], json.loads(json.dumps(used))
+            if before["n_timesteps"] < now["n_timesteps"]:
+                self._write_record({**record, "n_timesteps": self.n_timesteps, "arguments": sys.argv[1:], "hyperparams": now})
+                before = {**before, "n_timesteps": now["n_timesteps"]}
             if before != now:
                 changed = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
                 raise ValueError(
@@ -237,8 +260,11 @@ class MetaExperimentManager(ExperimentManager):
             "versions": {name: version(name) for name in PACKAGES if _is_installed(name)},
             "hyperparams": used,
         }
-        with atomic_path(Path(self.save_path) / "run.json") as path:
-            path.write_text(json.dumps(run, indent=2, default=str))
+        self._write_record(run)
+
+    def _write_record(self, record: dict[str, Any]) -> None:
+        with atomic_path(Path(self.save_path) / RECORD) as path:
+            path.write_text(json.dumps(record, indent=2, default=str))
 
 
 def _is_installed(name: str) -> bool:
@@ -268,7 +294,9 @@ def _soft_interrupt(checkpointing: CheckpointCallback | None) -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def run_rl_zoo(program: str, arguments: list[str], method: str | None = None, resumed: Path | None = None) -> None:
+def run_rl_zoo(
+    program: str, arguments: list[str], method: str | None = None, resumed: Path | None = None, trust: bool = False
+) -> None:
     """
     rl_zoo3's train with PEARL in it.
 
@@ -276,16 +304,18 @@ def run_rl_zoo(program: str, arguments: list[str], method: str | None = None, re
     :param arguments: for it
     :param method: name of the method; that of the YAML file by default
     :param resumed: folder of the run that goes on, None for a new one
+    :param trust: whether files may have code run
     """
     ALGOS["pearl"] = PEARL
     HYPERPARAMS_CONVERTER["pearl"] = convert_pearl_params
-    manager = partial(MetaExperimentManager, method=method, resumed=resumed)
+    manager = partial(MetaExperimentManager, method=method, resumed=resumed, trust=trust)
     # rl_zoo3 looks these names up when it needs them
     replaced: dict[ModuleType, dict[str, Any]] = {
         exp_manager: {
             "EvalCallback": MetaEvalCallback,
             "TrialEvalCallback": MetaTrialEvalCallback,
             "CheckpointCallback": CheckpointCallback,
+            "ProgressBarCallback": MetaProgressBarCallback,
         },
         rl_zoo3.train: {"ExperimentManager": manager},
     }

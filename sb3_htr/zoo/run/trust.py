@@ -1,0 +1,97 @@
+"""
+What files may ask for. A user may have code run by naming it on the command line; a file, which may come from a stranger, may
+not, unless the user says ``--trust``.
+"""
+
+import ast
+import importlib
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+# Packages of envs that a file may have imported, where they are installed
+PACKAGES = ("htr_envs", "gymnasium_robotics", "metaworld", "panda_gym")
+# Settings of a YAML file that rl_zoo3 imports by their names, and those that it evaluates as Python if they are strings
+IMPORTED = ("callback", "env_wrapper", "vec_env_wrapper", "replay_buffer_class")
+EVALUATED = ("policy_kwargs", "replay_buffer_kwargs", "monitor_kwargs")
+# Arguments of a training whose values rl_zoo3 evaluates as Python, key by key
+KEY_VALUES = ("-params", "--hyperparams", "--env-kwargs", "--eval-env-kwargs")
+
+
+def refuse(file: object, what: str) -> ValueError:
+    """
+    :param file: that asks for it
+    :param what: would happen
+    :return: to be raised
+    """
+    return ValueError(f"{file} {what}, which can run any code: add --trust if you know where the file comes from.")
+
+
+def plain_settings(hyperparams: dict[str, Any], file: object, trust: bool) -> dict[str, Any]:
+    """
+    :param hyperparams: of a YAML file
+    :param file: for messages
+    :param trust: whether it may have code run
+    :return: the same, with strings that rl_zoo3 would evaluate replaced by the values that they spell
+    :raises ValueError: if code would be run
+    """
+    hyperparams = dict(hyperparams)
+    if trust:
+        return hyperparams
+    for key in IMPORTED:
+        if hyperparams.get(key) is not None:
+            raise refuse(file, f"has {key}: {hyperparams[key]!r}")
+    if "." in str(hyperparams.get("policy", "")):
+        raise refuse(file, f"has policy: {hyperparams['policy']!r}")
+    for key in EVALUATED:
+        if isinstance(hyperparams.get(key), str):
+            try:
+                hyperparams[key] = ast.literal_eval(hyperparams[key])
+            except (ValueError, SyntaxError):
+                raise refuse(file, f"has {key}: {hyperparams[key]!r}") from None
+    return hyperparams
+
+
+def check_arguments(arguments: Sequence[str], file: object, trust: bool) -> None:
+    """
+    :param arguments: of a training, from the record of a run
+    :param file: the record, for messages
+    :param trust: whether it may have code run
+    :raises ValueError: if code would be run
+    """
+    option = ""
+    for word in () if trust else arguments:
+        if word.startswith("-") and not word[1:2].isdecimal():
+            option = word
+        elif option in KEY_VALUES:
+            try:
+                ast.literal_eval(word.partition(":")[2])
+            except (ValueError, SyntaxError):
+                raise refuse(file, f"has the argument {word!r}") from None
+        elif option in ("-conf", "--conf-file") and Path(word).suffix not in (".yml", ".yaml"):
+            raise refuse(file, f"reads its settings from {word!r}")
+
+
+def import_packages(named: Iterable[str], asked_for: Iterable[str] = (), file: object = "", trust: bool = False) -> None:
+    """
+    :param named: modules that register envs, by the user
+    :param asked_for: the same, by a file
+    :param file: for messages
+    :param trust: whether the file may have code run
+    :raises ValueError: for one that is not there, or that a file may not have imported
+    """
+    named = list(named)
+    for name in asked_for:
+        if name not in (*named, *PACKAGES) and not trust:
+            raise ValueError(
+                f"{file} asks for the module {name!r}, and importing it runs it: add --gym-packages {name} if you know it."
+            )
+    for name in dict.fromkeys((*named, *asked_for)):
+        try:
+            importlib.import_module(name)
+        except ModuleNotFoundError as error:
+            if error.name != name.split(".")[0]:
+                raise
+            raise ValueError(
+                f"The env needs the module {name}, which is not found: install it, or add its folder to PYTHONPATH."
+            ) from None
