@@ -468,6 +468,8 @@ class OffPolicyMetaAlgorithm(SAC):
             with zipfile.ZipFile(file) as archive:
                 if archive.testzip() is not None:
                     raise EOFError
+            if isinstance(file, io.IOBase):
+                file.seek(0)
             state = th.load(file, weights_only=True)
             replay, task_bank = state["replay"], state["task_bank"]
         except (RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError, zipfile.BadZipFile):
