@@ -17,6 +17,21 @@ from sb3_htr.pearl.policies import PEARLPolicy
 # What a file may unpack to, and how large its networks may be
 MAX_BYTES, MAX_LAYERS, MAX_UNITS = 2**30, 16, 2**14
 EXPLORERS = ("explorer", "train_explorer")
+# Numbers among the arguments of PEARL that take no memory, and counters
+NUMBERS = (
+    *(
+        "learning_rate",
+        "learning_starts",
+        "batch_size",
+        "tau",
+        "gamma",
+        "gradient_steps",
+        "ent_coef",
+        "target_update_interval",
+    ),
+    *("meta_batch_size", "context_size", "kl_coef", "n_tasks_per_rollout", "n_episodes_per_task"),
+)
+COUNTERS = ("num_timesteps", "_n_updates")
 
 
 def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.device | str = "auto", **kwargs: Any) -> PEARL:
@@ -25,8 +40,8 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
     weights take.
 
     SB3's ``load`` unpickles what is no plain JSON in the file, and a pickle can run anything. This function reads the sizes of
-    the networks, the explorers and their settings, and the size of a context; it makes a new model with them and fills in the
-    weights. What only training needs is left at its defaults.
+    the networks, the explorers and their settings, and plain numbers; it makes a new model with them and fills in the weights.
+    Schedules and the settings of the replay buffer, which only training needs, are left at their defaults.
 
     :param path: file of ``PEARL.save``
     :param env: env of the same spaces; its spaces are not read from the file
@@ -38,7 +53,8 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
     try:
         data, weights = _read(path)
         settings: dict[str, Any] = {name: _plain(data[name]) for name in EXPLORERS}
-        settings["context_size"] = int(data["context_size"])
+        settings |= {name: data[name] for name in NUMBERS if type(data.get(name)) in (int, float)}
+        counters = {name: data[name] for name in COUNTERS if type(data.get(name)) is int}
         settings["policy_kwargs"] = _policy_kwargs(data.get("policy_kwargs", {}))
     except Exception as error:  # whatever a stranger can put into a file
         why = f": {error}" if isinstance(error, ValueError) and "PEARL" in str(error) else "."
@@ -52,6 +68,8 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
         model.knowledge.load_state_dict(weights["knowledge"])
     except (RuntimeError, TypeError, AttributeError) as error:
         raise ValueError(f"The weights in {path} do not fit the env or the settings: {_last_line(error)}") from None
+    for name, value in counters.items():
+        setattr(model, name, value)
     return model
 
 

@@ -59,23 +59,31 @@ def test_loading_an_untrusted_model_runs_no_code(tiny_pearl: MakePEARL, tmp_path
     hostile: dict[str, Any] = {name: serialized for name in [*data, "learning_rate", "gamma", "replay_buffer_class"]}
     hostile["policy_kwargs"] = {**data["policy_kwargs"], "optimizer_class": serialized}
     repack(tmp_path / "model.zip", tmp_path / "bomb.zip", {"data": json.dumps(hostile).encode()})
+    with pytest.raises(ValueError, match=r"bomb\.zip is damaged, or no model saved by PEARL"):
+        load_untrusted(tmp_path / "bomb.zip", ENV_ID)
+    # What it needs is read, all else is ignored; its weights are fine
+    hostile |= {name: data[name] for name in ("explorer", "train_explorer")}
+    with pytest.raises(ValueError, match="its policy has the setting 'optimizer_class', which only PEARL.load restores"):
+        repack(tmp_path / "model.zip", tmp_path / "bomb.zip", {"data": json.dumps(hostile).encode()})
+        load_untrusted(tmp_path / "bomb.zip", ENV_ID)
+    hostile["policy_kwargs"] = data["policy_kwargs"]
+    repack(tmp_path / "model.zip", tmp_path / "bomb.zip", {"data": json.dumps(hostile).encode()})
+    load_untrusted(tmp_path / "bomb.zip", ENV_ID)
+    hostile["explorer"] = serialized
+    repack(tmp_path / "model.zip", tmp_path / "bomb.zip", {"data": json.dumps(hostile).encode()})
     with pytest.raises(ValueError, match=r"explorer is {}, expected one of"):
         load_untrusted(tmp_path / "bomb.zip", ENV_ID)
-    # Its other settings are ignored, its weights are fine
-    load_untrusted(tmp_path / "bomb.zip", ENV_ID, explorer="search", train_explorer="prior")
+    load_untrusted(tmp_path / "bomb.zip", ENV_ID, explorer="search")
     assert not fuse.exists()
-    del hostile["explorer"]
-    repack(tmp_path / "model.zip", tmp_path / "bomb.zip", {"data": json.dumps(hostile).encode()})
-    with pytest.raises(ValueError, match=r"explorer is None, expected one of"):
-        load_untrusted(tmp_path / "bomb.zip", ENV_ID)
 
 
 def test_an_untrusted_model_acts_as_the_one_that_was_saved(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
     explorers: dict[str, Any] = {"explorer": Search(scale=2.0), "train_explorer": Prior(2)}
-    model = tiny_pearl(gamma=0.7, kl_coef=0.02, **explorers).learn(3 * ROLLOUT)
+    model = tiny_pearl(gamma=0.7, kl_coef=0.02, context_size=7, **explorers).learn(3 * ROLLOUT)
     model.save(tmp_path / "model.zip")
     loaded = load_untrusted(tmp_path / "model.zip", ENV_ID)
-    assert loaded.gamma == 0.7 and loaded.kl_coef == 0.02
+    assert loaded.gamma == 0.7 and loaded.kl_coef == 0.02 and loaded.context_size == 7
+    assert loaded.num_timesteps == model.num_timesteps and loaded._n_updates == model._n_updates
     assert loaded.explorer == Search(scale=2.0) and loaded.train_explorer == Prior(2)
     assert load_untrusted(tmp_path / "model.zip", ENV_ID, explorer="prior").explorer == Prior()
     for a, b in zip(evaluate_adaptation(model, ENV_ID), evaluate_adaptation(loaded, ENV_ID), strict=True):

@@ -64,7 +64,7 @@ def test_agents_that_are_not_there_are_said_to_be_so(tmp_path: Path, tiny_pearl:
         ([str(tmp_path / "text.zip")], "is no model file"),
         ([str(tmp_path / "absent")], "absent does not exist: give a run folder"),
         ([str(tmp_path / "loose.zip")], "does not say which env it was trained on: add --env ID"),
-        ([*NOWHERE, "--task", "21"], "There is no test task 21: --task takes numbers from 1 to 20"),
+        ([*NOWHERE, "--task", "101"], "There is no test task 101: --task takes numbers from 1 to 100"),
         ([*NOWHERE, "--n-tasks", "0"], "--n-tasks is 0, expected at least 1"),
         ([*NOWHERE, "--device", "cudaa"], "The device 'cudaa' cannot be used: give cpu, cuda or cuda:N"),
         ([str(SHIPPED), "--env", "SparseAnt-v0"], "was trained on SparsePointRobot-v0, but --env is SparseAnt-v0"),
@@ -106,8 +106,10 @@ def test_a_model_of_another_version_is_said_to_be_one(tmp_path: Path, tiny_pearl
         with zipfile.ZipFile(tmp_path / "mixed.zip", "w") as mixed:
             for name in shipped_file.namelist():
                 mixed.writestr(name, (other if name == "policy.pth" else shipped_file).read(name))
-    with pytest.raises(ValueError, match=r"mixed.zip has other networks than this version makes \(it is of sb3_htr 0.1.0\)"):
+    with pytest.raises(ValueError, match=r"weights in .*mixed.zip do not fit .*: actor.latent_pi.0.weight has shape \(8, 5\)"):
         main(["enjoy", str(tmp_path / "mixed.zip"), "--no-render"])
+    with pytest.raises(ValueError, match=r"mixed.zip has other networks than this version makes \(it is of sb3_htr 0.1.0\)"):
+        main(["enjoy", str(tmp_path / "mixed.zip"), "--no-render", "--trust"])
 
 
 def test_a_folder_to_share_says_how_to_use_it(
