@@ -20,7 +20,7 @@ from sb3_htr.common.vec_env import make_task_vec_env
 @pytest.mark.parametrize("explorer", ["prior", "aggregate", "search"])
 def test_meta_evaluation_works_before_any_training(tiny_pearl: MakePEARL, explorer: str) -> None:
     returns, successes = evaluate_adaptation(tiny_pearl(), ENV_ID, n_episodes=3, explorer=explorer)
-    assert returns.shape == successes.shape == (20, 3)
+    assert returns.shape == successes.shape == (100, 3)
     assert ((returns > 0) == successes).all()
 
 
@@ -97,7 +97,7 @@ def test_no_test_task_enters_the_replay_buffer(tiny_pearl: MakePEARL) -> None:
 
 def test_achieved_tasks_are_the_path(tiny_pearl: MakePEARL) -> None:
     record = record_adaptation(tiny_pearl(), ENV_ID, n_episodes=2)
-    assert record.achieved.shape == (20, 2, 20, 2) and np.isfinite(record.achieved).all()
+    assert record.achieved.shape == (100, 2, 20, 2) and np.isfinite(record.achieved).all()
     steps = np.abs(np.diff(record.achieved, axis=2))
     assert steps.max() <= 0.1 + 1e-6
 

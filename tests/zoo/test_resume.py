@@ -69,25 +69,31 @@ def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run_folder(folder)
 
 
-def cut_off(run: Path, folder: Path, steps: int) -> Path:
-    """A copy of a run as if it had been killed some time after its checkpoint of ``steps``."""
+def cut_off(run: Path, folder: Path) -> Path:
+    """A copy of a run as if it had been killed in its last rollout, with all the files of the future still lying around."""
     copy = run_folder(folder / "cut")
     shutil.copytree(run, copy)
     (copy / f"{ENV_ID}.zip").unlink()
+    shutil.rmtree(copy / "checkpoints" / f"{STEPS}_steps")
     return copy
 
 
 def test_a_run_goes_on_exactly(unbroken: Path, tmp_path: Path) -> None:
-    """With all the files of the future still lying around."""
-    run = cut_off(unbroken, tmp_path, STEPS)
-    kept = checkpoints(run)
-    assert len(kept) == 2 and int(kept[0].name.split("_")[0]) < STEPS
-    for _ in range(2):
-        shutil.rmtree(checkpoints(run)[0])
-        if not checkpoints(run):
-            break
+    """Also once more."""
+    run = unbroken
+    for which in ("first", "second"):
+        run = cut_off(run, tmp_path / which)
+        (kept,) = checkpoints(run)
+        assert kept.name == "2160_steps"
         assert main(["train", "--resume", str(run)]) == 0
         assert_same_run(run, unbroken)
+
+
+def test_a_finished_run_says_so(unbroken: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = {path: path.stat().st_mtime_ns for path in unbroken.rglob("*")}
+    assert main(["train", "--resume", str(unbroken)]) == 0
+    assert f"{unbroken} is finished, after 2,400 env steps" in capsys.readouterr().out
+    assert before == {path: path.stat().st_mtime_ns for path in unbroken.rglob("*")}
 
 
 @pytest.mark.parametrize(
@@ -102,7 +108,7 @@ def test_a_run_goes_on_exactly(unbroken: Path, tmp_path: Path) -> None:
 def test_runs_of_all_kinds_go_on_exactly(settings: list[str], tmp_path: Path) -> None:
     assert main([*TRAIN, *settings, "-f", str(tmp_path)]) == 0
     run = run_folder(tmp_path)
-    copy = cut_off(run, tmp_path, STEPS)
+    copy = cut_off(run, tmp_path)
     assert main(["train", "--resume", str(copy)]) == 0
     assert_same_run(copy, run)
 
@@ -119,13 +125,16 @@ def test_tensorboard_shows_each_point_once(tmp_path: Path) -> None:
     assert main([*TRAIN, "-f", str(tmp_path), "-tb", str(tmp_path / "tb")]) == 0
     names = ["train/critic_loss", "rollout/ep_rew_mean", "eval/mean_reward"]
     before = [points(name) for name in names]
-    assert main(["train", "--resume", str(run_folder(tmp_path))]) == 0
+    run = run_folder(tmp_path)
+    (run / f"{ENV_ID}.zip").unlink()
+    shutil.rmtree(checkpoints(run)[0])
+    assert main(["train", "--resume", str(run)]) == 0
     assert [points(name) for name in names] == before
 
 
 def test_the_last_one_cleans_up(unbroken: Path, tmp_path: Path) -> None:
     """Killed after the last checkpoint was written and before older ones were removed, and while writing one."""
-    run = cut_off(unbroken, tmp_path, STEPS)
+    run = cut_off(unbroken, tmp_path)
     shutil.copytree(checkpoints(run)[-1], run / "checkpoints" / "1_steps")
     (run / "checkpoints" / ".240_steps.1.tmp").mkdir()
     assert main(["train", "--resume", str(run)]) == 0
@@ -159,6 +168,7 @@ def test_kills_at_random_moments_change_nothing(unbroken: Path, tmp_path: Path) 
         else:  # it was faster, and is done
             assert_same_run(run, unbroken)
             shutil.rmtree(run.parent)
+    (run / f"{ENV_ID}.zip").unlink(missing_ok=True)
     (run / "checkpoints" / ".240_steps.1.tmp").mkdir()  # as a kill while writing leaves it
     subprocess.run([*command, "train", "--resume", str(run)], env=environment, check=True, capture_output=True)
     assert_same_run(run, unbroken)
@@ -200,9 +210,11 @@ def test_a_full_disk_stops_no_training(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_changed_settings_and_extra_arguments_are_refused(unbroken: Path, tmp_path: Path) -> None:
-    run = cut_off(unbroken, tmp_path, STEPS)
-    with pytest.raises(ValueError, match=r"own arguments: leave -n 5 away"):
-        main(["train", "--resume", str(run), "-n", "5"])
+    run = cut_off(unbroken, tmp_path)
+    with pytest.raises(ValueError, match=r"own arguments: leave --seed 5 away"):
+        main(["train", "--resume", str(run), "--seed", "5"])
+    with pytest.raises(ValueError, match=r"own arguments: leave --method away"):
+        main(["train", "--resume", str(run), "--method", "htr-ec"])
     record = json.loads((run / "run.json").read_text())
     record["hyperparams"]["gamma"] = 0.5
     (run / "run.json").write_text(json.dumps(record))

@@ -16,8 +16,8 @@ from sb3_htr.zoo.show.play import Moment, Player
 
 
 def test_enjoy_shows_an_agent_that_adapts(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["enjoy", *NOWHERE, "--no-render", "--n-tasks", "50", "--n-episodes", "1"]) == 0
-    assert "There are only 20 test tasks, fewer than --n-tasks 50" in capsys.readouterr().out
+    assert main(["enjoy", *NOWHERE, "--no-render", "--n-tasks", "150", "--n-episodes", "1"]) == 0
+    assert "There are only 100 test tasks, fewer than --n-tasks 150" in capsys.readouterr().out
     assert main(["enjoy", *NOWHERE, "--no-render", "--n-tasks", "2", "--n-episodes", "6"]) == 0
     lines = capsys.readouterr().out.splitlines()
     episodes = [line for line in lines if line.startswith("  episode")]
@@ -30,7 +30,7 @@ def test_enjoy_shows_an_agent_that_adapts(capsys: pytest.CaptureFixture[str]) ->
 def test_enjoy_needs_no_screen(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["enjoy", *NOWHERE, "--task", "3", "--n-episodes", "1"]) == 0
     output = capsys.readouterr().out
-    assert "Numbers only: no screen" in output and "test task 3 of 20" in output
+    assert "Numbers only: no screen" in output and "test task 3 of 100" in output
 
 
 def test_enjoy_ends_with_its_window_or_its_steps(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
