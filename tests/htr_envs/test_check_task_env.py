@@ -5,10 +5,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from broken_envs import BROKEN, LineEnv, LineFamily, column
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 
+from helpers.broken_envs import BROKEN, LineEnv, LineFamily, column
 from htr_envs import check_task_env
 
 # Annotations here are wide on purpose: most of these classes break the types that they should have.

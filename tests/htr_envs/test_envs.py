@@ -9,33 +9,21 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from broken_envs import LineFamily
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from gymnasium.utils.env_checker import data_equivalence
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-from htr_envs import Dynamics, DynamicsEnv, DynamicsVectorEnv, TaskEnv, TaskVectorEnv, Trajectory, check_task_env
+from helpers.broken_envs import LineFamily
+from helpers.envs import make, make_vec
+from htr_envs import Dynamics, DynamicsEnv, DynamicsVectorEnv, Trajectory, check_task_env
 
 ENV_IDS = [env_id for env_id, spec in gym.registry.items() if str(spec.entry_point).startswith("htr_envs.")]
 POINT_ROBOT = "SparsePointRobot-v0"
 NOISY_STARTS = ("SparseWheeled-v0", "SparseAnt-v0")
 
 all_envs = pytest.mark.parametrize("env_id", ENV_IDS)
-
-
-def make(env_id: str, **kwargs: Any) -> tuple[gym.Env[Any, Any], TaskEnv]:
-    env = gym.make(env_id, **kwargs)
-    base = env.unwrapped
-    assert isinstance(base, TaskEnv)
-    return env, base
-
-
-def make_vec(env_id: str, num_envs: int, **kwargs: Any) -> TaskVectorEnv:
-    env = gym.make_vec(env_id, num_envs=num_envs, **kwargs)
-    assert isinstance(env, TaskVectorEnv)
-    return env
 
 
 def play(env: gym.Env[Any, Any], seed: int, **reset_kwargs: Any) -> list[tuple[Any, ...]]:

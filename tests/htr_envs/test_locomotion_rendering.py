@@ -7,10 +7,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import data_equivalence
 
-pytest.importorskip("mujoco")
-
-from test_locomotion_envs import both_envs, make, random_actions, robots
-
+from helpers.robots import both_envs, make, random_actions, robots
 from htr_envs import DynamicsEnv
 
 

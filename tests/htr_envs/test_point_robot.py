@@ -10,11 +10,12 @@ from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from test_envs import make, make_vec
 
+from helpers.envs import make, make_vec
 from htr_envs import PointRobotEnv, PointRobotFamily, PointRobotVectorEnv, Trajectory
 
 POINT_ROBOT = "SparsePointRobot-v0"
+TASK_SETS = ("train", "validation", "test")
 
 
 def trajectory_to(next_observations: Any) -> Trajectory:
@@ -53,14 +54,21 @@ def test_a_hindsight_task_is_solved_by_its_own_state(states: Any, indices: list[
     np.testing.assert_array_equal(family.compute_reward(traj, tasks)[np.arange(3), indices], 1.0)
 
 
-def test_the_split_is_that_of_pearls_reference() -> None:
-    # what the reference does: goals at even angles, then one legacy shuffle of the rows with seed 1337
+def reference_goals() -> Any:
+    """Of PEARL's reference: goals at even angles, then one legacy shuffle of the rows with seed 1337."""
     angles = np.linspace(0.0, np.pi, 100)
     goals = np.stack((np.cos(angles), np.sin(angles)), axis=1)
     np.random.RandomState(1337).shuffle(goals)
-    family = PointRobotFamily()
-    np.testing.assert_array_equal(family.train_tasks, goals[:80].astype(np.float32))
-    np.testing.assert_array_equal(family.test_tasks, goals[-20:].astype(np.float32))
+    return goals.astype(np.float32)
+
+
+def test_the_training_tasks_are_those_of_pearls_reference() -> None:
+    np.testing.assert_array_equal(PointRobotFamily().train_tasks, reference_goals()[:80])
+
+
+def parts_of_the_semicircle(tasks: Any) -> Any:
+    """From 0 to 1, ascending."""
+    return np.sort(np.arctan2(np.abs(tasks[:, 1]), tasks[:, 0]).astype(np.float64)) / np.pi
 
 
 @given(
@@ -79,10 +87,35 @@ def test_tasks_lie_on_the_semicircle_in_the_numbers_asked_for(
     tasks = np.concatenate(sets)
     np.testing.assert_allclose(np.linalg.norm(tasks, axis=-1), distance, rtol=1e-5)
     assert (tasks[:, 1] >= -1e-6).all()
-    # even angles: the train and test tasks fill the semicircle from end to end
-    grid = np.sort(np.arctan2(np.abs(np.concatenate(sets[:2])[:, 1]), np.concatenate(sets[:2])[:, 0]))
-    np.testing.assert_allclose(grid, np.linspace(0.0, np.pi, n_train + n_test), atol=1e-5)
-    assert not np.array_equal(PointRobotFamily(distance, task_seed=1).train_tasks, PointRobotFamily(distance).train_tasks)
+    # Training tasks are of an even grid; of the others, there is one in each of as many equal sectors
+    n_grid = n_train + max(n_train // 4, 1)
+    place = parts_of_the_semicircle(family.train_tasks) * (n_grid - 1)
+    np.testing.assert_allclose(place, place.round(), atol=1e-4)
+    assert len(set(place.round())) == n_train
+    for drawn in (family.test_tasks, family.validation_tasks):
+        place = parts_of_the_semicircle(drawn) * len(drawn)
+        assert (place > np.arange(len(drawn)) - 1e-4).all() and (place < np.arange(len(drawn)) + 1 + 1e-4).all()
+    other = PointRobotFamily(distance, task_seed=(task_seed + 1) % 2**32, **sizes)
+    for name in ("test_tasks", "validation_tasks"):
+        assert not np.array_equal(getattr(other, name), getattr(family, name))
+
+
+def test_no_test_task_is_a_training_task_of_any_seed() -> None:
+    families = [PointRobotFamily(task_seed=seed) for seed in range(20)]
+    sets = ({tuple(task) for family in families for task in getattr(family, f"{name}_tasks")} for name in TASK_SETS)
+    train, validation, test = sets
+    assert len(train) == 100 and len(validation) == 20 * 20 and len(test) == 20 * 100
+    assert not (train & validation or train & test or validation & test)
+
+
+@pytest.mark.parametrize("sector", [(0.0, 60.0), (60.0, 90.0), (120.0, 180.0)])
+def test_a_sector_can_be_held_out_of_training(sector: tuple[float, float]) -> None:
+    family, (low, high) = PointRobotFamily(held_out=sector), np.array(sector) / 180
+    train = parts_of_the_semicircle(family.train_tasks)
+    assert len(train) == 80 and ((train < low + 1e-5) | (train > high - 1e-5)).all()
+    for tasks in (family.test_tasks, family.validation_tasks):
+        inside = parts_of_the_semicircle(tasks)
+        assert (inside > low - 1e-5).all() and (inside < high + 1e-5).all() and np.ptp(inside) > 0.8 * (high - low)
 
 
 def test_dynamics_are_clipped_steps_that_stay_in_the_arena() -> None:
@@ -106,8 +139,7 @@ def test_an_episode_is_twenty_steps_also_at_the_goal() -> None:
 
 
 def test_every_task_is_solvable_and_pays_what_was_computed_elsewhere() -> None:
-    family = PointRobotFamily()
-    tasks = np.concatenate((family.train_tasks, family.test_tasks))
+    tasks = reference_goals()
     vector = PointRobotVectorEnv(num_envs=100)
     observations, _ = vector.reset(options={"task": tasks})
     returns = np.zeros(100)
@@ -149,10 +181,13 @@ def test_random_exploration_finds_the_goal_in_at_most_one_episode_of_a_thousand(
         {"n_train_tasks": 0},
         {"n_test_tasks": 0},
         {"n_validation_tasks": 0},
+        {"held_out": (90, 45)},
+        {"held_out": (0, 180)},
+        {"held_out": (-10, 45)},
     ],
 )
 def test_impossible_arguments_are_refused(kwargs: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=next(iter(kwargs))):
+    with pytest.raises(ValueError, match=next(iter(kwargs)).replace("_", "[ _]")):
         gym.make(POINT_ROBOT, **kwargs)
 
 
