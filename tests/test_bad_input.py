@@ -7,19 +7,16 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from conftest import ENV_ID, many
 from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from helpers import ENV_ID, ROLLOUT, MakePEARL, many
 from htr_envs import PointRobotEnv, PointRobotVectorEnv
 from sb3_htr import PEARL
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
 from sb3_htr.zoo.cli import main
-
-MakePEARL = Callable[..., PEARL]
-ROLLOUT = 4 * 3 * 20
 
 
 class WithoutTaskId(gym.Wrapper[Any, Any, Any, Any]):
@@ -54,7 +51,7 @@ class WithoutHook(gym.Wrapper[Any, Any, Any, Any]):
         (lambda: WithSpaces(gym.make(ENV_ID), action_space=spaces.Discrete(3)), "The action space is Discrete"),
         (lambda: gym.make(ENV_ID, reward_type="dense"), "reward_type is not 'sparse'.*rl_reward_type"),
         (lambda: PointRobotEnv(), "The env has no time limit"),
-        (lambda: VecNormalize(make_task_vec_env(ENV_ID, 2)), "VecNormalize rescales rewards.*pass norm_reward=False"),
+        (lambda: VecNormalize(make_task_vec_env(ENV_ID, 2)), "VecNormalize stands between .*normalize_observations"),
         (lambda: DummyVecEnv([lambda: gym.make("Pendulum-v1")]), "no task_family"),
     ],
 )
@@ -81,7 +78,13 @@ def test_an_unknown_id_is_gymnasiums_business(tiny_pearl: MakePEARL) -> None:
         ({"tau": float("nan")}, "tau is nan"),
         ({"gradient_steps": 0}, "gradient_steps is 0"),
         ({"learning_starts": -1}, "learning_starts is -1"),
-        ({"n_exploration_episodes": -1}, "n_exploration_episodes is -1"),
+        ({"explorer": {"name": "prior", "n_exploration_episodes": -1}}, "n_exploration_episodes is -1"),
+        ({"explorer": {"name": "prior", "scale": 1}}, "explorer 'prior' has no setting 'scale'"),
+        ({"train_explorer": {"scale": 1}}, "explorer is {'scale': 1}, expected one of"),
+        ({"replay_buffer_kwargs": {"hindsight_task_strategy": "even"}}, "has no setting 'hindsight_task_strategy': expected"),
+        ({"replay_buffer_kwargs": {"relabeller": "HER"}}, "relabeller is 'HER', expected one of"),
+        ({"replay_buffer_kwargs": {"relabeller": {"name": "EpisodeClustering", "cell": 1}}}, "'cell': did you mean cell_size"),
+        ({"policy_kwargs": {"normalise_observations": True}}, "did you mean normalize_observations"),
         ({"replay_buffer_kwargs": {"relabel_probabilty": 1}}, "'relabel_probabilty': did you mean relabel_probability"),
         ({"replay_buffer_kwargs": {"grid": 1}}, "replay_buffer_kwargs has no setting 'grid': expected one of"),
         ({"explorer": "random"}, "explorer is 'random', expected one of"),
@@ -133,7 +136,7 @@ def no_training_task(n_steps: int, values: list[Any]) -> None:
     [
         (put(1, float("nan")), r"The reward of task .* is nan, expected finite numbers"),
         (put(1, float("inf")), r"The reward of task .* is inf, expected finite numbers"),
-        (put(0, np.full(2, np.nan, dtype=np.float32)), r"The next observation of task .* is \[nan nan\], expected finite"),
+        (put(0, np.full(2, np.nan, dtype=np.float32)), r"The next_observation of task .* is \[nan nan\], expected finite"),
         (put(1, 0.5), r"The env gave 0.5 for a step of task \d+, but its compute_reward gives 0: .*check_task_env"),
         (put(0, np.zeros(3, dtype=np.float32)), r"An env failed at env step \d+, on one of .* tasks \[\d+\].*the shape of"),
         (put(3, False), r"An episode is longer than the env's time limit of 20 steps"),
@@ -232,16 +235,3 @@ def test_fuzzed_settings_are_taken_or_refused_in_one_sentence(kwargs: dict[str, 
     except ValueError as error:
         assert str(error).count("\n") == 0
         assert any(name in str(error) for name in (*kwargs, *replay))
-
-
-def test_options_of_a_batch_must_agree() -> None:
-    env = make_task_vec_env(ENV_ID, 2)
-    env.set_options([{"task_id": 1}, {}])
-    with pytest.raises(ValueError, match="options with the same keys"):
-        env.reset()
-
-
-def test_only_same_step_autoreset_can_be_an_sb3_vec_env() -> None:
-    env = gym.make_vec(ENV_ID, 2, vectorization_mode="sync")
-    with pytest.raises(ValueError, match=r"expected AutoresetMode\.SAME_STEP"):
-        BatchedTaskVecEnv(env)

@@ -6,9 +6,8 @@ import shlex
 from pathlib import Path
 
 import pytest
-from test_zoo import SMALL
-from test_zoo_optimize import quick  # noqa: F401 fixture
 
+from helpers.runs import SMALL
 from sb3_htr.zoo.cli import main
 
 ROOT = Path(__file__).parents[1]
@@ -32,6 +31,12 @@ def test_the_code_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     runpy.run_path("page.py", run_name="__main__")
 
 
+def test_the_tests_that_repeat_a_figure_are_there() -> None:
+    commands = re.findall(r"`[^`]*\bpytest ([^`]+)`", "".join(page.read_text() for page in ROOT.glob("docs/*.md")))
+    files = [word for command in commands for word in command.split() if word.startswith("tests/")]
+    assert len(files) > 5 and all((ROOT / file).exists() for file in files), files
+
+
 def test_a_new_family_takes_less_than_60_lines() -> None:
     assert len(python_blocks(ROOT / "docs" / "own_task_family.md").splitlines()) < 60
 
@@ -49,7 +54,7 @@ SHORT = {
 
 
 def test_the_commands_run(
-    quick: None,  # noqa: F811
+    quick: None,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -61,6 +66,6 @@ def test_the_commands_run(
     assert {command for command, *_ in commands} == SHORT.keys()
     for command, *arguments in commands:
         assert main([command, *arguments, *SHORT[command]]) == 0, arguments
-    written = ("runs/pearl/SparsePointRobot-v0_1/adaptation_curve.png", "adaptation.gif", "pictures/learning_curves.png")
+    written = ("runs/htr-ser/SparsePointRobot-v0_1/adaptation_curve.png", "adaptation.gif", "pictures/learning_curves.png")
     for name in (*written, "plots/adaptation_paths.png", "study.db", "my_agent/README.md"):
         assert (tmp_path / name).stat().st_size > 1000, name

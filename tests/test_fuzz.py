@@ -6,14 +6,17 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from conftest import ENV_ID, make_buffer, many
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from helpers import ENV_ID, many
+from helpers.experience import make_buffer
 from htr_envs import PointRobotFamily, TargetSpeedFamily
-from sb3_htr.htr import EpisodeClustering, MultiTaskReplayBuffer
+from sb3_htr.adaptation.explorers import EXPLORERS, to_explorer
+from sb3_htr.htr.relabel import RELABELLERS
 from sb3_htr.zoo.cli import main
-from sb3_htr.zoo.run.yaml_values import without_code
+from sb3_htr.zoo.run.method import merged
+from sb3_htr.zoo.run.trust import EVALUATED, IMPORTED, plain_settings
 
 FAMILY = PointRobotFamily(n_train_tasks=5, n_test_tasks=2, n_validation_tasks=2)
 anything = st.one_of(
@@ -25,37 +28,54 @@ anything = st.one_of(
     st.lists(st.floats(-1, 1), max_size=3),
     st.sampled_from(["random", "final", "even", "episode", "task", "sparse", "dense"]),
 )
-BUFFER_SETTINGS = [
-    *("relabel_probability", "hindsight_task_strategy", "rl_batch_source", "rl_reward_type", "context_episodes"),
-    *("buffer_size", "cell_size", "exploratory_fraction"),
-]
+BUFFER_SETTINGS = ["relabel_probability", "rl_reward_type", "context_episodes", "buffer_size"]
+RELABELLER_SETTINGS = ["hindsight_task_strategy", "rl_batch_source", "cell_size", "exploratory_fraction"]
+EXPLORER_SETTINGS = ["n_exploration_episodes", "scale", "max_setbacks", "clearly_better"]
+
+
+def settings_of(names: list[str]) -> st.SearchStrategy[dict[str, Any]]:
+    return st.dictionaries(st.sampled_from(names), anything, max_size=3)
 
 
 @many
-@example({"exploratory_fraction": "\n"}, True)
-@given(st.dictionaries(st.sampled_from(BUFFER_SETTINGS), anything, max_size=3), st.booleans())
-def test_buffers(kwargs: dict[str, Any], clustering: bool) -> None:
+@example({}, "EpisodeClustering", {"exploratory_fraction": "\n"})
+@given(settings_of(BUFFER_SETTINGS), st.sampled_from(sorted(RELABELLERS)), settings_of(RELABELLER_SETTINGS))
+def test_buffers(kwargs: dict[str, Any], name: str, settings: dict[str, Any]) -> None:
     try:
-        buffer = make_buffer(FAMILY, buffer_class=EpisodeClustering if clustering else MultiTaskReplayBuffer, **kwargs)
+        buffer = make_buffer(task_family=FAMILY, relabeller={"name": name, **settings}, **kwargs)
     except ValueError as error:
-        assert str(error).count("\n") == 0 and any(name in str(error) for name in kwargs)
-    except TypeError as error:
-        assert not clustering and "unexpected keyword" in str(error), "PEARL checks the names before"
+        assert str(error).count("\n") == 0 and any(given_name in str(error) for given_name in (*kwargs, *settings))
     else:
         assert 0 <= buffer.relabel_probability <= 1 and buffer.context_episodes >= 1
+        assert type(buffer.relabeller).__name__ == name
+        assert all(hasattr(buffer.relabeller, setting) for setting in settings if setting != "cell_size"), "none is ignored"
+
+
+@many
+@given(st.sampled_from(sorted(EXPLORERS)), settings_of(EXPLORER_SETTINGS))
+def test_explorers(name: str, settings: dict[str, Any]) -> None:
+    try:
+        explorer = to_explorer({"name": name, **settings})
+    except ValueError as error:
+        assert str(error).count("\n") == 0 and any(setting in str(error) for setting in settings)
+    else:
+        assert all(getattr(explorer, setting) == value for setting, value in settings.items())
 
 
 @many
 @given(st.data())
 def test_add_and_sample(data: st.DataObject) -> None:
     """Whatever steps come, ``add`` takes them or refuses them, and ``sample`` only knows whole episodes of one task."""
+    relabeller = {"name": data.draw(st.sampled_from(sorted(RELABELLERS)))}
+    relabeller["hindsight_task_strategy"] = data.draw(st.sampled_from(["random", "final", "even"]))
+    if relabeller["name"] == "SingleEpisodeRelabelling":
+        relabeller["rl_batch_source"] = data.draw(st.sampled_from(["episode", "task"]))
     buffer = make_buffer(
-        FAMILY,
+        task_family=FAMILY,
         n_envs=2,
         buffer_size=5 * 20 * data.draw(st.integers(1, 4)),
         relabel_probability=data.draw(st.floats(0, 1)),
-        hindsight_task_strategy=data.draw(st.sampled_from(["random", "final", "even"])),
-        rl_batch_source=data.draw(st.sampled_from(["episode", "task"])),
+        relabeller=relabeller,
     )
     rng = np.random.default_rng(data.draw(st.integers(0, 99)))
     tasks = np.zeros(2, dtype=np.int64)
@@ -81,10 +101,11 @@ def test_add_and_sample(data: st.DataObject) -> None:
             buffer.sample(sizes[0], meta_batch_size=sizes[1], context_size=sizes[2])
         return
     sample = buffer.sample(sizes[0], meta_batch_size=sizes[1], context_size=sizes[2])
-    assert sample.observations.shape == (sample.lengths.sum(), 2) and sample.context.shape == (sample.context_lengths.sum(), 5)
-    assert all(np.isfinite(np.asarray(tensor)).all() for tensor in sample)
+    for drawn in (sample, sample.context):
+        assert drawn.observations.shape == drawn.actions.shape == (drawn.lengths.sum(), 2)
+    assert all(np.isfinite(np.asarray(tensor)).all() for tensor in (*sample.context, *sample[1:]))
     assert (buffer.n_episodes[sample.task_ids] > 0).all()
-    for lengths, largest in ((sample.lengths, sizes[0]), (sample.context_lengths, sizes[2])):
+    for lengths, largest in ((sample.lengths, sizes[0]), (sample.context.lengths, sizes[2])):
         assert len(lengths) == sizes[1] and (lengths >= 1).all() and (lengths <= largest).all()
 
 
@@ -105,13 +126,13 @@ def test_families(family: Any, data: st.DataObject) -> None:
 CODE = "__import__('pathlib').Path({fuse!r}).touch()"
 
 
-@pytest.mark.parametrize("key", ["policy_kwargs", "replay_buffer_kwargs", "normalize", "replay_buffer_class"])
+@pytest.mark.parametrize("key", [*EVALUATED, *IMPORTED, "policy"])
 def test_yaml_files_run_no_code(key: str, tmp_path: Path) -> None:
     fuse = tmp_path / "fuse"
     file = tmp_path / "hostile.yml"
     block = {"policy": "MlpPolicy", "n_timesteps": 100, "n_envs": 2, key: CODE.format(fuse=str(fuse))}
     file.write_text(yaml.safe_dump({ENV_ID: block}))
-    with pytest.raises(ValueError, match=rf"{key} is .*(which is code|expected one of)"):
+    with pytest.raises(ValueError, match=rf"hostile.yml has {key}: .*, which can run any code: add --trust"):
         main(["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(file)])
     file.write_text(f"{ENV_ID}: !!python/object/apply:os.system ['touch {fuse}']")
     with pytest.raises(yaml.YAMLError):
@@ -120,11 +141,21 @@ def test_yaml_files_run_no_code(key: str, tmp_path: Path) -> None:
 
 
 @many
-@given(st.dictionaries(st.sampled_from(["policy_kwargs", "normalize", "replay_buffer_class"]), anything))
+@given(st.dictionaries(st.sampled_from(["policy_kwargs", "normalize", "replay_buffer_class", "gamma"]), anything))
 def test_yaml_values(hyperparams: dict[str, Any]) -> None:
     try:
-        read = without_code(hyperparams)
-    except (ValueError, ImportError) as error:
+        read = plain_settings(hyperparams, "file.yml", trust=False)
+    except ValueError as error:
         assert str(error).count("\n") == 0
     else:
         assert read.keys() == hyperparams.keys()
+
+
+keys = st.sampled_from(["a", "b", "name"])
+trees = st.recursive(anything, lambda inner: st.dictionaries(keys, inner, max_size=3), max_leaves=4)
+
+
+@given(st.dictionaries(keys, trees, max_size=3), st.dictionaries(keys, trees, max_size=3))
+def test_settings_can_always_be_joined(first: dict[str, Any], second: dict[str, Any]) -> None:
+    assert merged(first, second).keys() == {*first, *second}
+    assert repr(merged(first, {})) == repr(first) and repr(merged({}, second)) == repr(second)

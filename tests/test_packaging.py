@@ -9,7 +9,8 @@ from configparser import ConfigParser
 from pathlib import Path
 
 import pytest
-from test_zoo import SMALL
+
+from helpers.runs import SMALL
 
 ROOT = Path(__file__).parents[1]
 SOURCES = ("sb3_htr", "htr_envs", "hyperparams", "trained_agents", "setup.cfg", "pyproject.toml", "README.md", "LICENSE")

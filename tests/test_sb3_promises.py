@@ -1,6 +1,5 @@
 """What users of Stable-Baselines3 rely on in any algorithm."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -8,26 +7,22 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from conftest import ENV_ID
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import CallbackList, CheckpointCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_htr import PEARL
+from helpers import ENV_ID, ROLLOUT, MakePEARL
+from helpers import parameters as all_parameters
 from sb3_htr.common.vec_env import make_task_vec_env
-
-MakePEARL = Callable[..., PEARL]
-ROLLOUT = 4 * 3 * 20
 
 
 def test_parameters_can_be_read_and_set(tiny_pearl: MakePEARL) -> None:
     model, other = tiny_pearl().learn(2 * ROLLOUT), tiny_pearl(seed=5)
     parameters: dict[str, Any] = model.get_parameters()
-    assert set(parameters) == {"policy", "actor.optimizer", "critic.optimizer", "encoder.optimizer"}
+    assert set(parameters) == {"policy", "knowledge", "actor.optimizer", "critic.optimizer", "encoder.optimizer"}
     other.set_parameters(parameters)
-    for name, value in model.policy.state_dict().items():
-        assert th.equal(value, other.policy.state_dict()[name]), name
+    for name, value in all_parameters(model).items():
+        assert th.equal(value, all_parameters(other)[name]), name
     with pytest.raises(ValueError, match="Names of parameters do not match"):
         other.set_parameters({"policy": parameters["policy"]})
     other.set_parameters({"policy": parameters["policy"]}, exact_match=False)
@@ -86,13 +81,9 @@ def test_envs_can_be_replaced_by_equal_ones_only(tiny_pearl: MakePEARL) -> None:
     with pytest.raises(AssertionError, match="number of environments"):
         model.set_env(make_task_vec_env(ENV_ID, 3))
     with pytest.raises(ValueError, match="Observation spaces do not match"):
-        model.set_env(make_task_vec_env("SparseTargetSpeed-v0", 4))
-
-
-def test_the_normalization_of_an_env_is_found(tiny_pearl: MakePEARL) -> None:
-    env = VecNormalize(make_task_vec_env(ENV_ID, 4), norm_reward=False)
-    assert tiny_pearl(env).get_vec_normalize_env() is env
-    assert tiny_pearl().get_vec_normalize_env() is None
+        tiny_pearl().set_env(make_task_vec_env("SparseTargetSpeed-v0", 4))
+    with pytest.raises(ValueError, match=r"The env has another task family: its goal_distance is 0\.5"):
+        model.set_env(make_task_vec_env(ENV_ID, 4, env_kwargs={"goal_distance": 0.5}))
 
 
 class Rescaled(gym.ActionWrapper[Any, Any, Any]):

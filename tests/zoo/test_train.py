@@ -19,6 +19,7 @@ from sb3_htr import PEARL
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.zoo.cli import main
+from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback
 from sb3_htr.zoo.run.manager import MetaExperimentManager
 from sb3_htr.zoo.run.memory import keep_freed_memory
 from sb3_htr.zoo.run.method import DEFAULT, get_method, merged
@@ -139,8 +140,6 @@ def test_the_command_line_names_the_last_checkpoint_of_a_run_that_diverged(tmp_p
 
 
 def test_a_trial_can_be_pruned(tmp_path: Path) -> None:
-    from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback
-
     class Trial:
         def __init__(self) -> None:
             self.reported: list[tuple[float, int]] = []
@@ -152,7 +151,7 @@ def test_a_trial_can_be_pruned(tmp_path: Path) -> None:
             return len(self.reported) == 2
 
     trial = Trial()
-    callback = MetaTrialEvalCallback(make_task_vec_env(ENV_ID, 20), trial, eval_freq=20, n_adaptation_episodes=2)
+    callback = MetaTrialEvalCallback(make_task_vec_env(ENV_ID, 20), cast(Any, trial), eval_freq=20, n_adaptation_episodes=2)
     model = PEARL("MlpPolicy", ENV_ID, **TINY).learn(2400, callback=callback)
     assert callback.is_pruned and model.num_timesteps == 2 * 20 * 4
     assert [step for _, step in trial.reported] == [1, 2]

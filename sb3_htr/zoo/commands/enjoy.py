@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from sb3_htr.zoo.show.window import Window
 
 EXAMPLE = """  sb3-htr enjoy --env SparsePointRobot-v0              an agent that comes with the package, or yours in logs/
-  sb3-htr enjoy runs/pearl/SparsePointRobot-v0_1 --task 3 7
+  sb3-htr enjoy runs/htr-ser/SparsePointRobot-v0_1 --task 3 7
   sb3-htr enjoy --env SparsePointRobot-v0 -f runs --no-render --explorer prior"""
 
 # Shows a moment; False to stop

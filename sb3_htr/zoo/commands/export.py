@@ -16,7 +16,7 @@ from sb3_htr.zoo.commands.arguments import add_agent_arguments, make_parser, par
 from sb3_htr.zoo.run.agents import RECORD, TrainedAgent
 from sb3_htr.zoo.run.model_card import model_card, training_command
 
-EXAMPLE = """  sb3-htr export runs/pearl/SparsePointRobot-v0_1 -o my_agent
+EXAMPLE = """  sb3-htr export runs/htr-ser/SparsePointRobot-v0_1 -o my_agent
   sb3-htr export runs --film --push-to-hub USER/pearl-SparsePointRobot-v0
   sb3-htr export runs -o agent.zip                                 the file alone"""
 # What a loaded model needs beside the arguments of PEARL
