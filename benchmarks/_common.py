@@ -17,8 +17,8 @@ import torch as th
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr import PEARL
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.zoo.run.memory import keep_freed_memory
 from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.zoo.run.memory import keep_freed_memory
 
 # As sb3-htr train does
 keep_freed_memory()

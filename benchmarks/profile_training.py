@@ -19,9 +19,9 @@ PARTS = {
     "drawing meta-batches": "replay_buffer.sample",
     "storing steps": "replay_buffer.add",
     "stepping the envs": "env.step",
-    "choosing actions": "policy.predict",
+    "choosing actions": "policy.act",
     "best episodes of training tasks": "task_bank.update",
-    "known tasks": "_update_latent_prior",
+    "known tasks": "_learn_knowledge",
     "Python between the operations of updates": "_update",
 }
 
