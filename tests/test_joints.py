@@ -1,0 +1,379 @@
+"""Where others add something of their own: a toy one of each kind, from outside of the package, in a few lines."""
+
+import inspect
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import torch as th
+import yaml
+from gymnasium import spaces
+from torch import nn
+from torch.nn import functional as F
+
+from helpers import ENV_ID, ROLLOUT, TINY, MakePEARL, parameters, with_policy
+from helpers.experience import by_task
+from helpers.runs import run_folder, train_arguments
+from htr_envs import Dynamics, DynamicsEnv, DynamicsVectorEnv, TaskFamily, at_step, check_reward_type, check_task_env
+from sb3_htr import PEARL, evaluate_adaptation
+from sb3_htr.adaptation import Explorer, Search, Step
+from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
+from sb3_htr.experiments import grid, report
+from sb3_htr.experiments.grid import Experiment, Variant
+from sb3_htr.htr import Relabeller
+from sb3_htr.htr.relabel import RELABELLERS, HindsightDraw
+from sb3_htr.zoo.cli import main
+from sb3_htr.zoo.run import method
+from sb3_htr.zoo.run.agents import RECORD, agent_at
+from sb3_htr.zoo.run.shipped import hyperparams_file
+
+# Annotations here are wide on purpose: these are somebody's own few lines.
+
+
+class RandomTrainingTask(Relabeller):
+    """A task's own episodes, under any training task but one."""
+
+    def __init__(self, never: int = -1) -> None:
+        self.never, self.n_episodes = never, 0
+
+    def on_episode(self, task: int, episode: Any) -> None:
+        self.n_episodes += 1
+
+    def draw(self, tasks: Any) -> HindsightDraw:
+        buffer = self.buffer
+        index, train = buffer.episodes.index(), buffer.task_family.train_tasks
+        allowed = np.delete(np.arange(len(train)), self.never) if self.never >= 0 else np.arange(len(train))
+        chosen = train[buffer.relabel_rng.choice(allowed, len(tasks))]
+        context = index.latest_episodes(tasks, buffer.context_episodes)
+        return HindsightDraw(buffer.episodes, context, index.all_episodes(tasks), chosen, is_relabelled=False)
+
+    def stats(self) -> dict[str, float]:
+        return {"replay/n_seen": self.n_episodes}
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"n_episodes": self.n_episodes}
+
+    def load_state_dict(self, state: Any) -> None:
+        self.n_episodes = state["n_episodes"]
+
+
+@dataclass
+class Lattice(Explorer):
+    """z from a lattice, one point after the other, until an episode is rewarded; then what was best."""
+
+    width: float = 1.0
+
+    def start(self) -> None:
+        n_envs, latent_dim = self.adaptation.n_envs, self.adaptation.policy.latent_dim
+        places = np.array([-self.width, 0.0, self.width], dtype=np.float32)
+        self.points = np.stack(np.meshgrid(*[places] * latent_dim), axis=-1).reshape(-1, latent_dim)
+        self.z = np.tile(self.points[0], (n_envs, 1))
+        self.best = np.zeros(n_envs)
+
+    def observe(self, step: Step) -> None:
+        for env in np.flatnonzero(step.dones):
+            if self.adaptation.episode_return[env] > self.best[env]:
+                self.best[env] = self.adaptation.episode_return[env]
+                self.adaptation.infer(np.array([env]), keep=False)
+            elif self.best[env] == 0:
+                self.z[env] = self.points[self.adaptation.n_episodes[env] % len(self.points)]
+
+    def exploring(self) -> Any:
+        return self.best == 0
+
+
+class GRUEncoder(nn.Module):
+    """Reads the context in the order of time. Its state is how many rows it has read, and what it remembers of them."""
+
+    optimizer: th.optim.Optimizer
+
+    def __init__(self, context_dim: int, latent_dim: int, net_arch: list[int], activation_fn: Any = nn.ReLU) -> None:
+        super().__init__()
+        self.hidden = net_arch[0]
+        self.gru = nn.GRU(context_dim, self.hidden, batch_first=True)
+        self.head = nn.Linear(self.hidden, 2 * latent_dim)
+
+    def empty(self, n_tasks: int) -> th.Tensor:
+        return self.head.weight.new_zeros(n_tasks, 1 + self.hidden)
+
+    def extend(self, state: th.Tensor, rows: th.Tensor, lengths: th.Tensor) -> th.Tensor:
+        read = state[:, :1] + lengths[:, None]
+        remembered = [
+            self.gru(task[None], before[None, None])[1][0, 0] if len(task) else before
+            for task, before in zip(rows.split(lengths.tolist()), state[:, 1:].contiguous(), strict=True)
+        ]
+        return th.cat([read, th.stack(remembered)], dim=1)
+
+    def posterior(self, state: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        mean, raw = self.head(state[:, 1:]).chunk(2, dim=-1)
+        nothing = state[:, :1] == 0
+        return mean.masked_fill(nothing, 0.0), (F.softplus(raw) + 1e-3).masked_fill(nothing, 1.0)
+
+
+class Heights(TaskFamily):
+    """Hold a height."""
+
+    def __init__(self) -> None:
+        heights = np.random.RandomState(0).uniform(0.3, 2.0, (60, 1)).astype(np.float32)
+        super().__init__(spaces.Box(-9.0, 9.0, (1,), np.float32), heights[:40], heights[40:50], heights[50:])
+
+    def sample_tasks(self, n: int, rng: Any) -> Any:
+        return rng.uniform(0.3, 2.0, (n, 1)).astype(np.float32)
+
+    def distance(self, traj: Any, task: Any) -> Any:
+        return np.abs(traj.next_observations[..., 0] - np.asarray(task, np.float32)[..., None, 0])
+
+    def compute_reward(self, traj: Any, task: Any, reward_type: str = "sparse") -> Any:
+        check_reward_type(reward_type)
+        distance = self.distance(traj, task)
+        goal = -distance if reward_type == "dense" else np.where(distance < 0.1, 1 - distance, np.float32(0))
+        return (goal + traj.task_free_reward).astype(np.float32)
+
+    def is_success(self, traj: Any, task: Any) -> Any:
+        return self.distance(traj, task) < 0.1
+
+    def hindsight_task(self, traj: Any, index: Any) -> Any:
+        return at_step(traj.next_observations, index)[..., :1]
+
+
+class Balloons(Dynamics[Heights]):
+    """Rise and sink, against the wind."""
+
+    def __init__(self, num_envs: int) -> None:
+        super().__init__(num_envs, spaces.Box(-9.0, 9.0, (1,), np.float32), spaces.Box(-1.0, 1.0, (1,), np.float32))
+        self.states = np.zeros((num_envs, 1), dtype=np.float32)
+
+    def reset(self, indices: Any, rng: Any) -> Any:
+        self.states[indices] = rng.uniform(-0.05, 0.05, (len(indices), 1))
+        return self.states[indices]
+
+    def step(self, actions: Any) -> Any:
+        lift = np.clip(actions, -1.0, 1.0)
+        self.states = np.clip(self.states + np.float32(0.15) * lift - np.float32(0.02), -9.0, 9.0)
+        return self.states, np.float32(-0.01) * lift[:, 0] ** 2, np.zeros(self.num_envs, dtype=np.bool_)
+
+
+TOYS = [(RandomTrainingTask,), (Lattice,), (GRUEncoder,), (Heights, Balloons)]
+
+
+@pytest.mark.parametrize("toy", TOYS, ids=lambda toy: toy[0].__name__)
+def test_it_takes_less_than_40_lines(toy: tuple[type, ...]) -> None:
+    assert sum(bool(line.strip()) for part in toy for line in inspect.getsource(part).splitlines()) < 40
+
+
+def z_acted_with(model: PEARL, monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
+    """Of everything that the model does from now on."""
+    seen: list[np.ndarray] = []
+    act = model.policy.act
+
+    def noting(obs: np.ndarray, z: np.ndarray, deterministic: bool = False) -> np.ndarray:
+        seen.append(z.copy())
+        return act(obs, z, deterministic)
+
+    monkeypatch.setattr(model.policy, "act", noting)
+    return seen
+
+
+# --- a relabeller
+
+
+@pytest.mark.parametrize("by_name", [False, True])
+def test_a_relabeller(tiny_pearl: MakePEARL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by_name: bool) -> None:
+    """As an object; or by a name, as YAML files have it."""
+    monkeypatch.setitem(RELABELLERS, "RandomTrainingTask", RandomTrainingTask)
+    relabeller: Any = {"name": "RandomTrainingTask", "never": 3} if by_name else RandomTrainingTask(never=3)
+    settings = {"replay_buffer_kwargs": {"relabel_probability": 1.0, "relabeller": relabeller}}
+    env_kwargs = {"goal_distance": 0.2, "n_train_tasks": 8}
+    model = tiny_pearl(make_task_vec_env(ENV_ID, 4, env_kwargs=env_kwargs), **settings).learn(3 * ROLLOUT, log_interval=None)
+    buffer = model.replay_buffer
+    assert buffer is not None and isinstance(buffer.relabeller, RandomTrainingTask)
+    assert buffer.relabeller.policy is model.policy, "for strategies that ask for values"
+    assert model.logger.name_to_value["replay/n_seen"] == buffer.relabeller.n_episodes == 36
+    # Each row has the rewards of one training task, whatever its own is, and never those of the one that is left out
+    data = buffer.sample(16, meta_batch_size=200)
+    assert data.relabelled.all()
+    family, columns = buffer.task_family, (by_task(x, data.lengths) for x in (data.next_observations, data.rewards))
+    named = np.zeros(8, dtype=int)
+    for place, reward in zip(*columns, strict=True):
+        distance = np.linalg.norm(place[:, None] - family.train_tasks, axis=-1)
+        matches = np.isclose(np.where(distance < 0.2, 1 - distance, 0), reward[:, None], atol=1e-5).all(axis=0)
+        assert matches.any()
+        if matches.sum() == 1:
+            named[matches.argmax()] += 1
+    assert named[3] == 0 and (np.delete(named, 3) > 0).sum() > 4
+    # Its state is saved with the replay
+    model.save_replay_buffer(tmp_path / "replay")
+    other = tiny_pearl(make_task_vec_env(ENV_ID, 4, env_kwargs=env_kwargs), **settings)
+    other.load_replay_buffer(tmp_path / "replay")
+    assert other.replay_buffer is not None and isinstance(other.replay_buffer.relabeller, RandomTrainingTask)
+    assert other.replay_buffer.relabeller.n_episodes == 36
+    returns, _ = evaluate_adaptation(model, ENV_ID, n_episodes=2)
+    assert np.isfinite(returns).all()
+
+
+# --- an explorer
+
+
+def test_an_explorer(tiny_pearl: MakePEARL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = tiny_pearl(explorer=Lattice(width=2.0), train_explorer=Lattice())
+    seen = z_acted_with(model, monkeypatch)
+    model.learn(2 * ROLLOUT)
+    visited = np.unique(np.concatenate(seen), axis=0)
+    assert visited.tolist() == [[-1, -1, -1], [-1, -1, 0], [-1, -1, 1]], "one of 27 points in each episode"
+    seen.clear()
+    expected = evaluate_adaptation(model, ENV_ID, n_episodes=5)
+    assert set(np.concatenate(seen).ravel()) <= {-2.0, 0.0, 2.0} and len(np.unique(np.concatenate(seen), axis=0)) == 5
+    agent = model.adapt(ENV_ID, n_episodes=2, task=np.zeros(2))
+    np.testing.assert_array_equal(agent.z, [-2.0, -2.0, -2.0], err_msg="the start solves it, and the first z was best")
+    # It is saved with the model, and can be given to another
+    model.save(tmp_path / "model")
+    loaded = PEARL.load(tmp_path / "model")
+    assert loaded.explorer == Lattice(width=2.0) and loaded.explorer.name == "lattice"
+    other, learnt = tiny_pearl(), dict[str, Any](model.get_parameters())
+    other.set_parameters(learnt)
+    for results in (
+        evaluate_adaptation(loaded, ENV_ID, n_episodes=5),
+        evaluate_adaptation(other, ENV_ID, None, 5, Lattice(2.0)),
+    ):
+        for ours, theirs in zip(results, expected, strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+
+
+# --- an encoder
+
+
+def test_an_encoder(tiny_pearl: MakePEARL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = tiny_pearl(policy_kwargs=with_policy(encoder_class=GRUEncoder), explorer="aggregate", gradient_steps=10)
+    before = parameters(model)
+    model.learn(3 * ROLLOUT)
+    assert isinstance(model.policy.encoder, GRUEncoder)
+    learnt = [name for name, value in parameters(model).items() if not th.equal(value, before[name])]
+    assert {"encoder.gru.weight_hh_l0", "encoder.head.weight"} <= set(learnt)
+    # The posterior that is acted with is that of this encoder, for which the order of steps matters
+    assert model.replay_buffer is not None
+    context = model.replay_buffer.sample(4, meta_batch_size=1, context_size=20).context
+    backwards = context._replace(observations=context.observations.flip(0), actions=context.actions.flip(0))
+    with th.no_grad():
+        assert not th.allclose(model.policy.infer(context)[0], model.policy.infer(backwards)[0])
+    seen = z_acted_with(model, monkeypatch)
+    monkeypatch.setattr(
+        GRUEncoder, "posterior", lambda self, state: (th.full((len(state), 3), 7.0), th.full((len(state), 3), 1e-12))
+    )
+    evaluate_adaptation(model, ENV_ID, np.zeros((1, 2), np.float32), n_episodes=2)
+    np.testing.assert_allclose(seen[-1], 7.0, atol=1e-4)
+    monkeypatch.undo()
+    model.save(tmp_path / "model")
+    for ours, theirs in zip(*(evaluate_adaptation(m, ENV_ID) for m in (model, PEARL.load(tmp_path / "model"))), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_what_a_recurrent_encoder_takes_in_later_is_taken_in_as_if_at_once(tiny_pearl: MakePEARL) -> None:
+    encoder = GRUEncoder(5, 3, [16])
+    rows, lengths = th.randn(12, 5), th.tensor([4, 0, 8])
+    early, late = th.cat([rows[:1], rows[4:7]]), th.cat([rows[1:4], rows[7:]])
+    state = encoder.extend(encoder.extend(encoder.empty(3), early, th.tensor([1, 0, 3])), late, th.tensor([3, 0, 5]))
+    th.testing.assert_close(state, encoder.extend(encoder.empty(3), rows, lengths))
+    mean, variance = encoder.posterior(state)
+    assert (mean[1] == 0).all() and (variance[1] == 1).all()
+
+
+# --- an env family
+
+
+@pytest.fixture
+def heights() -> Iterator[str]:
+    """Id of an env of one's own, single and batched."""
+    gym.register(
+        "SparseHeights-v0",
+        entry_point=lambda **kwargs: DynamicsEnv(Heights(), Balloons(1), **kwargs),
+        vector_entry_point=lambda num_envs, max_episode_steps, **kwargs: DynamicsVectorEnv(  # type: ignore[arg-type]
+            Heights(), Balloons(num_envs), max_episode_steps, **kwargs
+        ),
+        max_episode_steps=25,
+    )
+    yield "SparseHeights-v0"
+    del gym.registry["SparseHeights-v0"]
+
+
+def test_an_env_family(heights: str, tiny_pearl: MakePEARL) -> None:
+    check_task_env(gym.make(heights))
+    model = tiny_pearl(heights, gradient_steps=20).learn(4 * 4 * 3 * 25)
+    assert model.env is not None and isinstance(model.env.unwrapped, BatchedTaskVecEnv), "its batched env is used"
+    buffer = model.replay_buffer
+    assert buffer is not None and isinstance(buffer.task_family, Heights) and buffer.max_episode_steps == 25
+    assert model.task_bank is not None and len(model.task_bank.solved) > 10, "random flights, rewarded in hindsight"
+    data = buffer.sample(16, meta_batch_size=100)
+    assert data.rewards.min() < 0 and (~data.unrewarded[data.relabelled]).mean() > (~data.unrewarded[~data.relabelled]).mean()
+    returns, successes = evaluate_adaptation(model, heights, n_episodes=6)
+    assert returns.shape == (10, 6) and successes.any(axis=1).sum() > 2, "heights that it was never told of"
+    single, _ = evaluate_adaptation(model, gym.make(heights), n_episodes=1)
+    assert single.shape == (10, 1)
+
+
+# --- an experiment
+
+
+def test_an_experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A row of the grid; what it draws is its own too."""
+
+    def figure(results: Any, path: Path) -> None:
+        plt.figure(figsize=(1, 1)).savefig(path)
+        drawn.extend(cell.variant for cell in results)
+
+    drawn: list[str] = []
+    tiny = {**yaml.safe_load("{n_envs: 4, learning_starts: 240}"), **{key: TINY[key] for key in TINY if key != "seed"}}
+    row = Variant("htr-ser", "sharp", {**tiny, "explorer": {"scale": 0.7}})
+    experiment = Experiment("A toy.", ENV_ID, 960, (row,), 1, 480, explorers=("aggregate",), figure=figure)
+    monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 50)
+    monkeypatch.setitem(grid.EXPERIMENTS, "toy", experiment)
+    runs, results = tmp_path / "runs", tmp_path / "results"
+    report.run("toy", "python toy.py", experiment, experiment.cells(), runs, results, 1)
+    assert drawn == ["sharp"] and (results / "toy.png").exists()
+    summary = json.loads((results / "summary.json").read_text())
+    assert [row["variant"] for row in summary["rows"] if row["metric"] == "success_rate"] == drawn
+    agent = agent_at(runs / experiment.cells()[0].name)
+    assert agent.method == "htr-ser" and agent.load().explorer == Search(scale=0.7)
+
+
+# --- a method
+
+
+TOY_METHOD = """
+half-half:
+  label: 'Relabelled every other time, acted with at random'
+  relabeller: 'EpisodeClustering'
+  relabel_probability: 0.5
+  rl_reward_type: 'dense'
+  train_explorer: 'search'
+  explorer: 'aggregate'
+"""
+
+
+def test_a_method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """A block of methods.yml."""
+    (tmp_path / "methods.yml").write_text(hyperparams_file("methods.yml").read_text() + TOY_METHOD)
+    monkeypatch.setattr(method, "hyperparams_file", lambda name: tmp_path / name)
+    method.methods.cache_clear()
+    try:
+        assert main(train_arguments(tmp_path, 480, "--method", "half-half")) == 0
+        run = run_folder(tmp_path, "half-half")
+        model = agent_at(run, "last").load(trust=True)
+        assert json.loads((run / RECORD).read_text())["method"] == "half-half"
+        assert (model.explorer.name, model.train_explorer.name) == ("aggregate", "search")
+        buffer: Any = model.replay_buffer_kwargs
+        assert (buffer["relabel_probability"], buffer["rl_reward_type"]) == (0.5, "dense")
+        assert buffer["relabeller"]["name"] == "EpisodeClustering"
+        capsys.readouterr()
+        few = ["--no-render", "--n-tasks", "1", "--n-episodes", "1"]
+        assert main(["enjoy", "--env", ENV_ID, "-f", str(tmp_path), "--method", "half-half", *few]) == 0
+        assert f"{run}" in capsys.readouterr().out
+        assert main(train_arguments(tmp_path, 240, "--method", "half-half-prior")) == 0
+        assert agent_at(run_folder(tmp_path, "half-half-prior"), "last").load().explorer.name == "prior"
+    finally:
+        method.methods.cache_clear()
