@@ -31,9 +31,9 @@ def commit() -> dict[str, str | bool]:
         return subprocess.run(command, capture_output=True, text=True, check=True, cwd=Path(__file__).parent).stdout.strip()
 
     try:
-        return {
-            "commit": git("rev-parse", "--short=10", "HEAD"),
-            "clean": not git("status", "--porcelain", "--untracked-files=no"),
-        }
+        # An installed package may lie within a checkout of something else
+        git("ls-files", "--error-unmatch", Path(__file__).name)
+        changes = git("status", "--porcelain", "--untracked-files=no")
+        return {"commit": git("rev-parse", "--short=10", "HEAD"), "clean": not changes}
     except (OSError, subprocess.CalledProcessError):
         return {}
