@@ -141,6 +141,9 @@ class MujocoDynamics(Dynamics[SemicircleGoalFamily]):
         mujoco.mj_setState(self.model, data, path[-1], FULL_PHYSICS)
         data.mocap_pos[0, :2] = task
         mujoco.mj_forward(self.model, data)
+        if renderer.viewer is not None:
+            # another env's window, opened or closed since, may have taken it away
+            renderer.viewer.make_context_current()
         frame: NDArray[np.uint8] | None = renderer.render(render_mode)
         return frame
 

@@ -3,17 +3,16 @@
 import hashlib
 import json
 import os
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import torch as th
 
 from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.versions import versions
 
 FORMAT = 1
 STATE, MANIFEST = "state.pt", "manifest.json"
-PACKAGES = ("sb3_htr", "stable_baselines3", "torch", "numpy", "gymnasium")
 
 
 class DamagedCheckpoint(ValueError):
@@ -31,7 +30,7 @@ def write_checkpoint(folder: str | os.PathLike[str], state: dict[str, Any]) -> N
         th.save(state, temporary / STATE)
         manifest = {
             "format": FORMAT,
-            "versions": {package: _version(package) for package in PACKAGES},
+            "versions": versions(),
             "sha256": {STATE: _sha256(temporary / STATE)},
         }
         (temporary / MANIFEST).write_text(json.dumps(manifest, indent=1))
@@ -69,10 +68,3 @@ def _sha256(path: Path) -> str:
         while block := file.read(1 << 20):
             digest.update(block)
     return digest.hexdigest()
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "unknown"

@@ -16,7 +16,7 @@ import htr_envs  # noqa: F401 registers the envs
 from sb3_htr.adaptation.evaluation import evaluate_adaptation
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.resume import checkpoints
-from sb3_htr.zoo.run.agents import agent_at, find_run
+from sb3_htr.zoo.run.agents import RECORD, agent_at, find_run, read_record
 
 # Means over the training of what HTR paper, B.2 reasons with
 LOGGED = ("relabelled_fraction", "rl_reward_mean", "rl_zero_reward_fraction")
@@ -100,7 +100,7 @@ def run_cell(cell: Cell, folder: Path) -> Path:
         "timesteps": evaluations["timesteps"],
         "curve": evaluations["results"],
         "wall_s": wall,
-        "commit": _commit(),
+        "commit": _commit_of(run),
     }
     for explorer in cell.explorers:
         returns, successes = evaluate_adaptation(model, env, explorer=explorer)
@@ -117,13 +117,10 @@ def _resume(folder: Path) -> list[str] | None:
     return [sys.executable, "-m", "sb3_htr.zoo.cli", "train", "--resume", str(unfinished[-1])] if unfinished else None
 
 
-def _commit() -> str:
-    """Of the code that runs, empty outside a checkout."""
-    command = ["git", "rev-parse", "--short", "HEAD"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parent).stdout.strip()
-    except OSError:  # no git
-        return ""
+def _commit_of(run: Path) -> str:
+    """Of the code that trained, as it was when the training began."""
+    record = read_record(run / RECORD)
+    return f"{record.get('commit', 'unknown')}{'' if record.get('clean', True) else ' with changes'}"
 
 
 def run_cells(cells: list[Cell], folder: Path, jobs: int) -> dict[Cell, Path]:

@@ -1,11 +1,14 @@
 """The command ``sb3-htr``."""
 
+import difflib
 import importlib
 import os
 import sys
 from collections.abc import Sequence
 
 import gymnasium
+
+from sb3_htr.common.versions import versions
 
 COMMANDS = {
     "train": "meta-train an agent, with rl_zoo3's arguments and YAML files",
@@ -18,7 +21,7 @@ COMMANDS = {
     "export": "a small file to share, with a model card; can upload both to the Hugging Face Hub",
 }
 USAGE = (
-    "usage: sb3-htr COMMAND [ARGUMENTS]; sb3-htr COMMAND --help explains the arguments.\n\n"
+    "usage: sb3-htr COMMAND [ARGUMENTS]; sb3-htr COMMAND --help explains the arguments, sb3-htr --version the versions.\n\n"
     + "\n".join(f"  {name:<10} {text}" for name, text in COMMANDS.items())
     + "\n\nTo begin with, an agent that comes with the package:\n\n  sb3-htr enjoy --env SparsePointRobot-v0"
 )
@@ -49,7 +52,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments and arguments[0] in ("-h", "--help"):
         print(USAGE)
         return 0
+    if arguments and arguments[0] == "--version":
+        print("\n".join(f"{name} {version}" for name, version in versions().items()))
+        return 0
     if not arguments or arguments[0] not in COMMANDS:
+        if arguments:
+            nearest = difflib.get_close_matches(arguments[0], COMMANDS, n=1)
+            meant = f", did you mean {nearest[0]}?" if nearest else "."
+            print(f"sb3-htr has no command {arguments[0]!r}{meant}\n", file=sys.stderr)
         print(USAGE, file=sys.stderr)
         return 2
     command, *rest = arguments

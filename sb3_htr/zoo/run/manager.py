@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from datetime import datetime, timezone
 from functools import partial
-from importlib.metadata import version
 from io import StringIO
 from pathlib import Path
 from pprint import pprint
@@ -36,6 +35,7 @@ from sb3_htr.common.checks import check_keywords, check_numbers
 from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.resume import CheckpointCallback, checkpoints, cut_monitor_files, load_latest
 from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.common.versions import commit, versions
 from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.zoo.run.agents import RECORD, read_record
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback, ProgressCallback
@@ -44,7 +44,6 @@ from sb3_htr.zoo.run.method import DEFAULT, get_method, merged
 from sb3_htr.zoo.run.search_space import convert_pearl_params, sample_pearl_params
 from sb3_htr.zoo.run.trust import plain_settings
 
-PACKAGES = ("sb3_htr", "stable_baselines3", "gymnasium", "rl_zoo3", "torch", "numpy", "mujoco")
 # What a YAML file may have beside the arguments of PEARL
 ZOO_SETTINGS = ("n_envs", "n_timesteps", "env_wrapper", "vec_env_wrapper", "callback", "env_kwargs")
 # Tasks that an evaluation adapts to side by side
@@ -257,7 +256,8 @@ class MetaExperimentManager(ExperimentManager):
             "command": " ".join(sys.argv),
             "arguments": sys.argv[1:],
             "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-            "versions": {name: version(name) for name in PACKAGES if _is_installed(name)},
+            "versions": versions(),
+            **commit(),
             "hyperparams": used,
         }
         self._write_record(run)
@@ -265,14 +265,6 @@ class MetaExperimentManager(ExperimentManager):
     def _write_record(self, record: dict[str, Any]) -> None:
         with atomic_path(Path(self.save_path) / RECORD) as path:
             path.write_text(json.dumps(record, indent=2, default=str))
-
-
-def _is_installed(name: str) -> bool:
-    try:
-        version(name)
-    except ModuleNotFoundError:
-        return False
-    return True
 
 
 @contextmanager

@@ -1,0 +1,39 @@
+"""What a result was made with."""
+
+import platform
+import subprocess
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+PACKAGES = ("sb3_htr", "stable_baselines3", "gymnasium", "rl_zoo3", "torch", "numpy", "mujoco")
+
+
+def versions() -> dict[str, str]:
+    """
+    :return: of Python and of the packages that are installed
+    """
+    result = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            result[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return result
+
+
+def commit() -> dict[str, str | bool]:
+    """
+    :return: ``commit`` of the code that runs, and whether its working tree was ``clean``; nothing outside a checkout
+    """
+
+    def git(*arguments: str) -> str:
+        command = ["git", *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True, cwd=Path(__file__).parent).stdout.strip()
+
+    try:
+        # An installed package may lie within a checkout of something else
+        git("ls-files", "--error-unmatch", Path(__file__).name)
+        changes = git("status", "--porcelain", "--untracked-files=no")
+        return {"commit": git("rev-parse", "--short=10", "HEAD"), "clean": not changes}
+    except (OSError, subprocess.CalledProcessError):
+        return {}
