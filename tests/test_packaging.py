@@ -43,6 +43,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (wheel,) = dist.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(site)
+    assert {path.name for path in site.iterdir() if path.suffix != ".dist-info"} == {"sb3_htr", "htr_envs"}
     return site
 
 

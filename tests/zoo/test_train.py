@@ -13,6 +13,7 @@ import pytest
 import torch as th
 import yaml
 
+import sb3_htr
 from helpers import ENV_ID, TINY
 from helpers.runs import run_folder, train_arguments
 from sb3_htr import PEARL
@@ -218,7 +219,9 @@ def test_asking_the_c_library_is_harmless() -> None:
 
 def test_help_and_mistakes(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main(["--help"]) == 0 and "evaluate" in capsys.readouterr().out
-    assert main(["trian"]) == 2 and "usage: sb3-htr" in capsys.readouterr().err
+    assert main([]) == 2 and "usage: sb3-htr" in capsys.readouterr().err
+    assert main(["trian"]) == 2 and "no command 'trian', did you mean train?" in capsys.readouterr().err
+    assert main(["--version"]) == 0 and f"sb3_htr {sb3_htr.__version__}" in capsys.readouterr().out
     with pytest.raises(ValueError, match="--algo is 'sac', but sb3-htr trains pearl"):
         main(["train", "--env", ENV_ID, "--algo", "sac"])
     with pytest.raises(FileNotFoundError, match="There is no run in"):
