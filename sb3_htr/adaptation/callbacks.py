@@ -10,6 +10,7 @@ import torch as th
 from stable_baselines3.common.callbacks import EvalCallback
 
 from sb3_htr.adaptation.evaluation import MetaLearner, record_adaptation
+from sb3_htr.adaptation.explorers import to_explorer
 from sb3_htr.common.atomic import WRITE_ERRORS, atomic_path, reason
 from sb3_htr.common.checks import get_task_family
 
@@ -46,7 +47,7 @@ class MetaEvalCallback(EvalCallback):
             tasks = getattr(get_task_family(self.eval_env), f"{tasks}_tasks")
         self.tasks: np.ndarray = np.asarray(tasks)
         self.n_adaptation_episodes = n_adaptation_episodes
-        self.explorer = explorer
+        self.explorer = None if explorer is None else to_explorer(explorer)
         self.returns: list[np.ndarray] = []
         self.successes: list[np.ndarray] = []
 

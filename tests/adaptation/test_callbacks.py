@@ -38,6 +38,18 @@ def test_meta_eval_is_on_validation_tasks_unless_told(tmp_path: Path) -> None:
         MetaEvalCallback(env, tasks="tset")
 
 
+def test_meta_eval_explores_as_it_is_told(tiny_pearl: MakePEARL) -> None:
+    env, prior = make_task_vec_env(ENV_ID, 20), {"name": "prior", "n_exploration_episodes": 9}
+    model = tiny_pearl(learning_starts=1000)
+    callback = MetaEvalCallback(env, explorer=prior, eval_freq=60, n_adaptation_episodes=2, verbose=0)
+    model.learn(ROLLOUT, callback=callback)
+    expected, _ = evaluate_adaptation(model, env, callback.tasks, n_episodes=2, explorer=prior)
+    np.testing.assert_array_equal(callback.returns[0], expected)
+    # Before anything is trained
+    with pytest.raises(ValueError, match="explorer is 'nobody', expected one of"):
+        MetaEvalCallback(env, explorer="nobody")
+
+
 def test_a_full_disk_stops_no_evaluation(tiny_pearl: MakePEARL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     env = make_task_vec_env(ENV_ID, 20)
     callback = MetaEvalCallback(
