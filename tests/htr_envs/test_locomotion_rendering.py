@@ -64,10 +64,24 @@ def test_rendering_changes_nothing(env_id: str) -> None:
 
 
 @both_envs
+def test_pictures_survive_the_end_of_another_env(env_id: str) -> None:
+    (_, ours), (_, other) = (make(env_id, render_mode="rgb_array") for _ in range(2))
+    for env in (ours, other):
+        env.reset(seed=0, options={"task": [0.0, 1.0]})
+    before = picture(ours)
+    np.testing.assert_array_equal(picture(other), before)
+    other.close()
+    np.testing.assert_array_equal(picture(ours), before)
+    ours.close()
+
+
+@both_envs
 def test_a_window_shows_the_reset_and_each_step(env_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
     shown: list[Any] = []
 
     class Window:
+        viewer = None
+
         def __init__(self, model: Any, data: Any, *args: Any, **kwargs: Any) -> None:
             self.data = data
 
