@@ -11,6 +11,9 @@ from sb3_htr.adaptation.knowledge import LatentKnowledge
 from sb3_htr.adaptation.policy import ContextualPolicy
 from sb3_htr.common.type_aliases import Context
 
+# A return without its task-free part is that much above 0, or it is 0: the difference of two sums of float32
+ROUNDING = 1e-5
+
 
 class Step(NamedTuple):
     """
@@ -31,11 +34,6 @@ class Step(NamedTuple):
     dones: np.ndarray
     infos: list[dict[str, Any]]
 
-    @property
-    def task_free_rewards(self) -> np.ndarray:
-        """(n_envs,), the part of the rewards that depends on no task."""
-        return np.array([info.get("task_free_reward", 0.0) for info in self.infos])
-
 
 class Adaptation:
     """
@@ -51,6 +49,8 @@ class Adaptation:
     :param context_size: steps of an episode that the posterior is inferred from, evenly spread, at most: as many as in
         meta-training, because each narrows it
     :param generator: source of randomness; torch's global one by default
+    :param is_training: whether infos tell which part of a reward depends on no task. In meta-training they may; at meta-test
+        nothing is used but observations, actions and rewards
     """
 
     def __init__(
@@ -61,14 +61,18 @@ class Adaptation:
         n_envs: int,
         context_size: int,
         generator: th.Generator | None = None,
+        is_training: bool = False,
     ) -> None:
         self.policy = policy
         self.knowledge = knowledge
         self.n_envs = n_envs
         self.context_size = context_size
         self.generator = generator
+        self.is_training = is_training
         self.n_episodes = np.zeros(n_envs, dtype=np.int64)
-        # Without the task-free part: of the running episodes, and the largest of those that have ended
+        # Rewards of the task, 0 for steps without: of the latest step, of the running episodes, and the largest sum of those
+        # that have ended
+        self.task_reward = np.zeros(n_envs, dtype=np.float64)
         self.episode_return = np.zeros(n_envs, dtype=np.float64)
         self.best_return = np.zeros(n_envs, dtype=np.float64)
         # Of the running episodes: observations, actions, rewards
@@ -88,6 +92,7 @@ class Adaptation:
         :param deterministic: mean actions instead of samples
         :return: (n_envs, action_dim), scaled to [-1, 1]
         """
+        self.explorer.look(obs)
         return self.policy.act(obs, self.z, deterministic)
 
     def observe(self, step: Step) -> None:
@@ -95,13 +100,31 @@ class Adaptation:
         :param step: what each env did
         """
         self._remember(step.observations, step.actions, step.rewards)
-        self.episode_return += step.rewards - step.task_free_rewards
+        self.task_reward = self._told(step) if self.is_training else self._learned(step)
+        self.episode_return += self.task_reward
         ended = np.flatnonzero(step.dones)
         self.n_episodes[ended] += 1
         self.best_return[ended] = np.maximum(self.best_return[ended], self.episode_return[ended])
         self.explorer.observe(step)
         self.episode_return[ended] = 0
         self._n_steps[ended] = 0
+
+    @staticmethod
+    def _told(step: Step) -> np.ndarray:
+        beside = step.rewards - np.array([info.get("task_free_reward", 0.0) for info in step.infos])
+        # 0 or clearly more: the difference of two float32
+        return np.where(beside > ROUNDING, beside, 0.0)
+
+    def _learned(self, step: Step) -> np.ndarray:
+        policy, device = self.policy, self.policy.device
+        with th.no_grad():
+            obs, action, next_obs = (
+                th.as_tensor(x, dtype=th.float32, device=device)
+                for x in (step.observations, step.actions, step.next_observations)
+            )
+            task_free = policy.reward_model.task_free(policy.normalize(obs), action, policy.normalize(next_obs))
+        beside = step.rewards - task_free.cpu().numpy()
+        return np.where(beside > self.knowledge.threshold.item(), beside, 0.0)
 
     def _remember(self, *columns: np.ndarray) -> None:
         if not self._running:

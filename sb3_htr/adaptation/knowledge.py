@@ -1,4 +1,4 @@
-"""What meta-training knows about z before a task gave any reward."""
+"""What meta-training knows about tasks before one of them gave any reward."""
 
 from typing import NamedTuple
 
@@ -7,68 +7,77 @@ import torch as th
 from torch import nn
 
 from sb3_htr.adaptation.policy import ContextualPolicy
-from sb3_htr.adaptation.task_bank import TaskBank
+from sb3_htr.adaptation.task_bank import MAX_HINDSIGHT_TASKS, MAX_TRAIN_TASKS, TaskBank
+from sb3_htr.common.type_aliases import Context
+
+# Quantiles of what unrewarded and rewarded steps return beside what the model says is task-free; rewards are told from the
+# model's errors by the middle between the two
+UNREWARDED, REWARDED = 0.999, 0.001
 
 
-class KnownTasks(NamedTuple):
+class Particles(NamedTuple):
     """
-    What meta-training knows about n tasks and the episodes that solve them best.
+    n tasks that meta-training has solved, as points in the space of z: what an unknown task may be like.
 
-    :param z: (n, latent_dim), z of each task
-    :param returns: (n, n), ``returns[i, j]``: return of the episode of task i if task j is the true one, without the
-        task-free part, 0 where it does not find it
-    :param first_success: (n, n), number of steps before episode i finds task j, infinite where it does not
+    :param z: (n, latent_dim), posterior mean given the best episode known for the task
+    :param gain: (n, n), ``gain[i, j]``: mean reward of a rewarded step of episode i if task j is the true one, by the reward
+        model
+    :param returns: (n, n), return of the whole of episode i if task j is the true one, likewise
+    :param log_prior: (n,), logarithm of the probability that an unknown task is like this one
+    :param is_train: (n,) bool, training tasks; the others are hindsight tasks
     """
 
-    z: np.ndarray
-    returns: np.ndarray
-    first_success: np.ndarray
+    z: th.Tensor
+    gain: th.Tensor
+    returns: th.Tensor
+    log_prior: th.Tensor
+    is_train: th.Tensor
 
 
 class LatentKnowledge(nn.Module):
     """
     What explorers start from; saved with the model, not trained by gradients.
 
-    While the KL term is weak, posterior means are far from N(0, I). Two things are kept instead: the *aggregate*, mean and
-    covariance of the posterior means of recent meta-batches, and the *known tasks*: z of solved training tasks, and what
-    acting with each of them leads to under each other (:class:`KnownTasks`).
+    Two things are kept: the *aggregate*, mean and covariance of the posterior means of recent meta-batches, which are far from
+    N(0, I) while the KL term is weak; and :class:`Particles`.
 
     :param latent_dim: dimension of z
-    :param max_known_tasks: largest number of known tasks
     """
 
     mean: th.Tensor
     cholesky: th.Tensor
-    known_z: th.Tensor
-    known_returns: th.Tensor
-    known_first_success: th.Tensor
-    n_known_tasks: th.Tensor
+    threshold: th.Tensor
+    n_particles: th.Tensor
+    z: th.Tensor
+    gain: th.Tensor
+    returns: th.Tensor
+    log_prior: th.Tensor
+    is_train: th.Tensor
 
-    def __init__(self, latent_dim: int, max_known_tasks: int) -> None:
+    def __init__(self, latent_dim: int) -> None:
         super().__init__()
         self.latent_dim = latent_dim
+        n = MAX_TRAIN_TASKS + MAX_HINDSIGHT_TASKS
         self.register_buffer("mean", th.zeros(latent_dim))
         self.register_buffer("cholesky", th.eye(latent_dim))
-        self.register_buffer("known_z", th.zeros(max_known_tasks, latent_dim))
-        self.register_buffer("known_returns", th.zeros(max_known_tasks, max_known_tasks))
-        self.register_buffer("known_first_success", th.zeros(max_known_tasks, max_known_tasks))
-        self.register_buffer("n_known_tasks", th.zeros((), dtype=th.int64))
+        # Above it, what a step returned beside the task-free part is a reward of the task
+        self.register_buffer("threshold", th.tensor(0.5))
+        self.register_buffer("n_particles", th.zeros((), dtype=th.int64))
+        for name, shape in (("z", (n, latent_dim)), ("gain", (n, n)), ("returns", (n, n)), ("log_prior", (n,))):
+            self.register_buffer(name, th.zeros(shape))
+        self.register_buffer("is_train", th.zeros(n, dtype=th.bool))
 
-    def learn(self, policy: ContextualPolicy, means: th.Tensor, bank: TaskBank, context_size: int) -> None:
+    def learn(self, policy: ContextualPolicy, means: th.Tensor, bank: TaskBank) -> None:
         """
         :param policy: networks as they are now
         :param means: (n, latent_dim), posterior means of recent meta-batches
-        :param bank: the best episode of each training task
-        :param context_size: steps of an episode that become its context, at most
+        :param bank: tasks that were solved
         """
         self.set_aggregate(means)
-        # A loaded model's known tasks are kept until this training knows as many
-        if len(bank.solved) >= max(int(self.n_known_tasks), 1):
-            context, returns, first_success = bank.best_episodes(context_size, policy.device)
+        # A loaded model's particles are kept until this training knows as many
+        if int((bank.length > 0).sum()) >= max(int(self.n_particles), 1):
             with th.no_grad():
-                state = policy.extend_posterior(policy.encoder.empty(len(returns)), context)
-                z, _ = policy.encoder.posterior(state)
-            self.set_known_tasks(KnownTasks(z.cpu().numpy(), returns, first_success))
+                self._set_particles(policy, bank)
 
     def set_aggregate(self, means: th.Tensor) -> None:
         """
@@ -91,20 +100,54 @@ class LatentKnowledge(nn.Module):
         noise = th.randn(n, self.latent_dim, generator=generator).to(self.mean.device)
         return np.asarray((self.mean + scale * noise @ self.cholesky.T).cpu().numpy())
 
-    def set_known_tasks(self, known: KnownTasks) -> None:
-        """
-        :param known: at most ``max_known_tasks`` tasks
-        """
-        n = len(known.z)
-        self.known_z[:n] = th.as_tensor(known.z)
-        self.known_returns[:n, :n] = th.as_tensor(known.returns)
-        self.known_first_success[:n, :n] = th.as_tensor(known.first_success)
-        self.n_known_tasks.fill_(n)
+    def _set_particles(self, policy: ContextualPolicy, bank: TaskBank) -> None:
+        solved, columns, model = bank.solved(), bank.transitions, policy.reward_model
+        data = th.as_tensor(solved.rows, device=policy.device)
+        lengths = th.as_tensor(solved.lengths, device=policy.device)
+        action, reward = data[:, columns.action], data[:, columns.reward]
+        context = Context(data[:, columns.observation], action, reward, lengths)
+        state = policy.extend_posterior(policy.encoder.empty(len(lengths)), context)
+        z, _ = policy.encoder.posterior(state)
+        obs, next_obs = (policy.normalize(data[:, column]) for column in (columns.observation, columns.next_observation))
+        # Of the steps that are rewarded: chance of a reward, and reward to be expected, under each task
+        success = th.as_tensor(solved.success, device=policy.device)
+        episode = th.repeat_interleave(th.arange(len(z), device=z.device), lengths)[success]
+        states, tasks = model.state_tower(next_obs[success]), model.task_tower(z)
+        chance = model.success_logits(states, tasks).sigmoid()
+        expected = chance * model.success_rewards(states, tasks).clamp(min=0)
+        n_rewarded = th.zeros_like(z[:, 0]).index_add(0, episode, th.ones_like(episode, dtype=z.dtype)).clamp(min=1)[:, None]
+        overlap, earned = (th.zeros(len(z), len(z), device=z.device).index_add(0, episode, x) for x in (chance, expected))
+        overlap = overlap / n_rewarded
+        share = (earned / earned.diag().clamp(min=1e-6)[:, None]).clamp(0, 1.2)
+        is_train = th.as_tensor(solved.is_train, device=z.device)
+        returns = th.as_tensor(solved.returns, device=z.device)
+        particles = Particles(z, earned / n_rewarded, share * returns[:, None], _log_prior(z, overlap, is_train), is_train)
+        n = len(z)
+        self.z[:n], self.gain[:n, :n], self.returns[:n, :n], self.log_prior[:n], self.is_train[:n] = particles
+        self.n_particles.fill_(n)
+        beside = reward - model.task_free(obs, action, next_obs)
+        unrewarded = beside[~success].quantile(UNREWARDED) if (~success).any() else th.zeros(())
+        rewarded = beside[success].quantile(REWARDED)
+        self.threshold.copy_((unrewarded + rewarded) / 2)
 
-    def known_tasks(self) -> KnownTasks:
+    def particles(self) -> Particles:
         """
-        :return: the known tasks
+        :return: what an unknown task may be like; none before meta-training has solved a task
         """
-        n = int(self.n_known_tasks)
-        arrays = (self.known_z[:n], self.known_returns[:n, :n], self.known_first_success[:n, :n])
-        return KnownTasks(*(array.cpu().numpy() for array in arrays))
+        n = int(self.n_particles)
+        return Particles(self.z[:n], self.gain[:n, :n], self.returns[:n, :n], self.log_prior[:n], self.is_train[:n])
+
+
+def _log_prior(z: th.Tensor, overlap: th.Tensor, is_train: th.Tensor) -> th.Tensor:
+    """
+    Heavy tails around the training tasks, evenly over tasks: proportional to 1 / (1 + d^2) and inverse to the number of
+    particles that are alike. d is the distance in z to the nearest training task, in units of the distance at which two tasks
+    are half alike. (n,)
+    """
+    distance = th.cdist(z, z)
+    half_alike = distance[(overlap > 0.3) & (overlap < 0.7)]
+    unit = (half_alike if len(half_alike) else distance).median().clamp(min=1e-6)
+    # Before a training task is solved, all hindsight tasks are as likely
+    nearest = distance[:, is_train].amin(dim=1) / unit if is_train.any() else th.zeros_like(z[:, 0])
+    weight = 1 / ((1 + nearest.square()) * overlap.sum(dim=0).clamp(min=1))
+    return (weight / weight.sum()).clamp(min=1e-12).log()

@@ -1,6 +1,6 @@
 """What adaptation asks of networks, whatever they are."""
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch as th
@@ -29,9 +29,10 @@ class Encoder(Protocol):
 
 
 class ContextualPolicy(Protocol):
-    """Actor and encoder; :class:`sb3_htr.pearl.policies.PEARLPolicy` is one."""
+    """Actor, critics, encoder and a model of rewards; :class:`sb3_htr.pearl.policies.PEARLPolicy` is one."""
 
     latent_dim: int
+    reward_model: Any
 
     @property
     def encoder(self) -> Encoder:
@@ -45,6 +46,14 @@ class ContextualPolicy(Protocol):
 
     def extend_posterior(self, state: th.Tensor, context: Context) -> th.Tensor:
         """What the encoder's ``extend`` does, for transitions as they were collected."""
+        ...
+
+    def normalize(self, obs: th.Tensor) -> th.Tensor:
+        """Observations as all networks see them."""
+        ...
+
+    def values(self, obs: np.ndarray, z: th.Tensor) -> th.Tensor:
+        """Values (n, k) of acting with task variables (n, k, latent_dim) in observations (n, obs_dim)."""
         ...
 
     def act(self, obs: np.ndarray, z: np.ndarray, deterministic: bool = False) -> np.ndarray:

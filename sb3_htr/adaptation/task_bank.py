@@ -1,39 +1,70 @@
-"""The best episode known for each training task."""
+"""Tasks that meta-training has solved, each with the best episode known for it."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
 
 from sb3_htr.adaptation.context import evenly_spread
-from sb3_htr.common.type_aliases import Context, TaskFamily
+from sb3_htr.common.random_state import get_generator_state, set_generator_state
+from sb3_htr.common.type_aliases import TaskFamily
 from sb3_htr.htr.transitions import Transitions
 
-# Training tasks that episodes are kept for; of more, evenly spread ones. The cost of an episode is flat from there on
-MAX_TASKS = 128
+# Training tasks that are in the bank; of more, evenly spread ones. The cost of an episode is flat from there on
+MAX_TRAIN_TASKS = 128
+# Hindsight tasks; of more, a random one makes room
+MAX_HINDSIGHT_TASKS = 256
+# Steps of each new episode that may become hindsight tasks
+N_CANDIDATES = 8
 # Episodes rewarded under all tasks at a time, to bound memory
-CHUNK = 256
+CHUNK = 128
+
+
+class SolvedTasks(NamedTuple):
+    """
+    The n tasks of a bank that some episode has solved.
+
+    :param rows: (n_rows, width) transitions, those of the first task first, with the rewards of their task
+    :param lengths: (n,) int64, how many of them are of each task
+    :param success: (n_rows,) bool, whether each solves its task
+    :param returns: (n,) returns of the whole episodes, without the task-free part
+    :param is_train: (n,) bool, training tasks; the others are hindsight tasks
+    """
+
+    rows: np.ndarray
+    lengths: np.ndarray
+    success: np.ndarray
+    returns: np.ndarray
+    is_train: np.ndarray
 
 
 class TaskBank:
     """
-    For each training task, the best of all episodes of meta-training, whatever task they were collected on.
+    Training tasks, and hindsight tasks packed evenly over all that was reached, each with the best of all episodes of
+    meta-training, whatever task they were collected on.
 
-    It is hindsight relabelling once more: each new episode is rewarded under the training tasks.
+    It is hindsight relabelling once more: each new episode is rewarded under all these tasks. A state that solves none of the
+    hindsight tasks becomes one, so that they are as far apart as a task reaches, whatever tasks are. What it keeps of an
+    episode is what its context would be.
 
     :param task_family: reward hook and training tasks
     :param transitions: columns of an episode's rows
+    :param context_size: steps of an episode that are kept, evenly spread, at most
+    :param seed: of the choice of candidates
     """
 
-    def __init__(self, task_family: TaskFamily, transitions: Transitions) -> None:
+    def __init__(self, task_family: TaskFamily, transitions: Transitions, context_size: int, seed: int | None = None) -> None:
         self.task_family = task_family
         self.transitions = transitions
-        n_tasks = min(len(task_family.train_tasks), MAX_TASKS)
-        self.tasks = task_family.train_tasks[np.linspace(0, len(task_family.train_tasks) - 1, n_tasks).round().astype(int)]
+        self.context_size = context_size
+        train = task_family.train_tasks
+        self.n_train = min(len(train), MAX_TRAIN_TASKS)
+        self.tasks = train[np.linspace(0, len(train) - 1, self.n_train).round().astype(int)]
         # Returns without the task-free part, 0 where no episode solved the task
-        self.best_return = np.zeros(n_tasks, dtype=np.float32)
-        self.length = np.zeros(n_tasks, dtype=np.int64)
-        self.episodes = np.zeros((n_tasks, 0, transitions.width), dtype=np.float32)
+        self.best_return = np.zeros(self.n_train, dtype=np.float32)
+        self.length = np.zeros(self.n_train, dtype=np.int64)
+        self.episodes = np.zeros((self.n_train, context_size, transitions.width), dtype=np.float32)
+        self._rng = np.random.default_rng(seed)
         #: Training tasks and transitions of the episodes since the last :meth:`update`
         self.new: list[tuple[int, np.ndarray]] = []
 
@@ -45,74 +76,88 @@ class TaskBank:
         self.new.append((task, episode.copy()))
 
     def update(self) -> None:
-        """Reward the new episodes under all tasks."""
+        """Take in the new episodes."""
         new, self.new = [episode for _, episode in self.new], []
         for start in range(0, len(new), CHUNK):
-            self._update(new[start : start + CHUNK])
+            chunk = new[start : start + CHUNK]
+            length = np.array([len(episode) for episode in chunk])
+            episodes = np.stack([np.pad(episode, ((0, length.max() - len(episode)), (0, 0))) for episode in chunk])
+            self._pack(episodes, length)
+            self._reward(episodes, length)
 
-    def _update(self, new: list[np.ndarray]) -> None:
-        length = np.array([len(episode) for episode in new])
-        longest = max(int(length.max()), self.episodes.shape[1])
-        episodes = np.stack([_padded(episode, longest) for episode in new])
-        if longest > self.episodes.shape[1]:
-            self.episodes = np.stack([_padded(episode, longest) for episode in self.episodes])
-        valid = np.arange(longest) < length[:, None]
-        _, returns = self._outcome(episodes, valid, self.tasks)
+    def _pack(self, episodes: np.ndarray, length: np.ndarray) -> None:
+        """Candidates that solve no hindsight task become hindsight tasks."""
+        episode = np.repeat(np.arange(len(episodes)), N_CANDIDATES)
+        step = (self._rng.random(len(episode)) * length[episode]).astype(np.int64)
+        rows = episodes[episode, step][:, None, None]
+        solved = self.task_family.is_success(self.transitions.trajectory(rows), self.tasks[self.n_train :])
+        traj = self.transitions.trajectory(rows[~solved.any(axis=(1, 2))])
+        candidates = self.task_family.hindsight_task(traj, 0)[:, 0]
+        alike = self.task_family.is_success(traj, candidates)[..., 0]
+        chosen: list[int] = []
+        for i in range(len(candidates)):
+            if not alike[i, chosen].any():
+                chosen.append(i)
+        n_free = MAX_HINDSIGHT_TASKS - (len(self.tasks) - self.n_train)
+        self._append(candidates[chosen[:n_free]])
+        for i in chosen[max(n_free, 0) : max(n_free, 0) + MAX_HINDSIGHT_TASKS]:
+            at = self.n_train + self._rng.integers(MAX_HINDSIGHT_TASKS)
+            self.tasks[at], self.best_return[at], self.length[at] = candidates[i], 0, 0
+
+    def _append(self, tasks: np.ndarray) -> None:
+        n = len(tasks)
+        self.tasks = np.concatenate([self.tasks, tasks])
+        self.best_return = np.append(self.best_return, np.zeros(n, dtype=np.float32))
+        self.length = np.append(self.length, np.zeros(n, dtype=np.int64))
+        self.episodes = np.concatenate([self.episodes, np.zeros((n, *self.episodes.shape[1:]), dtype=np.float32)])
+
+    def _reward(self, episodes: np.ndarray, length: np.ndarray) -> None:
+        """Keep the episodes that are better than those known."""
+        traj = self.transitions.trajectory(episodes[:, None])
+        success = self.task_family.is_success(traj, self.tasks) & (np.arange(episodes.shape[1]) < length[:, None])[:, None]
+        reward = self.task_family.compute_reward(traj, self.tasks) - traj.task_free_reward
+        # 0 or clearly more: the reward without the task-free part is a difference of float32
+        returns = np.where(success, reward, 0.0).sum(axis=-1, dtype=np.float32)
         best = returns.argmax(axis=0)
         # A little more, because of rounding
         better = np.flatnonzero(returns.max(axis=0) > self.best_return + 1e-5)
         self.best_return[better] = returns[best[better], better]
-        self.length[better] = length[best[better]]
-        self.episodes[better] = episodes[best[better]]
+        steps, taken = evenly_spread(length[best[better]], self.context_size)
+        self.length[better] = taken
+        kept = np.arange(self.context_size) < taken[:, None]
+        within = self.episodes[better]
+        within[kept] = episodes[np.repeat(best[better], taken), steps]
+        self.episodes[better] = within
 
     def state_dict(self) -> dict[str, Any]:
         """
-        :return: the best episodes, for :meth:`load_state_dict`
+        :return: tasks and episodes, for :meth:`load_state_dict`
         """
-        arrays = {"best_return": self.best_return, "length": self.length, "episodes": self.episodes}
-        return {name: th.tensor(array) for name, array in arrays.items()}
+        arrays = {name: th.tensor(getattr(self, name)) for name in ("tasks", "best_return", "length", "episodes")}
+        return {**arrays, "random": get_generator_state(self._rng)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """
         :param state: of :meth:`state_dict`
         """
-        self.best_return, self.length, self.episodes = (
-            state[name].cpu().numpy().copy() for name in ("best_return", "length", "episodes")
-        )
+        for name in ("tasks", "best_return", "length", "episodes"):
+            setattr(self, name, state[name].cpu().numpy().copy())
+        set_generator_state(self._rng, state["random"])
 
     @property
-    def solved(self) -> np.ndarray:
-        """(n_solved,) int, the tasks that some episode would have solved."""
-        return np.flatnonzero(self.length)
+    def n_train_solved(self) -> int:
+        """Number of training tasks that some episode would have solved."""
+        return int((self.length[: self.n_train] > 0).sum())
 
-    def best_episodes(self, context_size: int, device: th.device) -> tuple[Context, np.ndarray, np.ndarray]:
+    def solved(self) -> SolvedTasks:
         """
-        What an unknown task may be like: the n solved tasks, each with its best episode.
-
-        :param context_size: steps of an episode that become its context, evenly spread, at most
-        :param device: where the contexts are put
-        :return: contexts of the tasks; and of episode i under task j the return without the task-free part (n, n) and the
-            number of steps before the first success (n, n), infinite without one
+        :return: the tasks that some episode would have solved
         """
-        solved, columns = self.solved, self.transitions
-        episodes, tasks = self.episodes[solved], self.tasks[solved]
-        valid = np.arange(episodes.shape[1]) < self.length[solved, None]
-        rewards = self.task_family.compute_reward(columns.trajectory(episodes), tasks)
-        steps, lengths = evenly_spread(self.length[solved], context_size)
-        at = np.repeat(np.arange(len(solved)), lengths), steps
-        arrays = (episodes[at][:, columns.observation], episodes[at][:, columns.action], rewards[at], lengths)
-        success, returns = self._outcome(episodes, valid, tasks)
-        first_success = np.where(success.any(axis=-1), success.argmax(axis=-1), np.inf)
-        return Context(*(th.as_tensor(array, device=device) for array in arrays)), returns, first_success.astype(np.float32)
-
-    def _outcome(self, episodes: np.ndarray, valid: np.ndarray, tasks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Successes (n, m, T) and returns without the task-free part (n, m) of n episodes under m tasks."""
-        traj = self.transitions.trajectory(episodes[:, None])
-        success = self.task_family.is_success(traj, tasks) & valid[:, None]
-        reward = self.task_family.compute_reward(traj, tasks) - traj.task_free_reward
-        # 0 or clearly more: the reward without the task-free part is a difference of float32
-        return success, np.where(success, reward, 0.0).sum(axis=-1, dtype=np.float32)
-
-
-def _padded(episode: np.ndarray, length: int) -> np.ndarray:
-    return np.pad(episode, ((0, length - len(episode)), (0, 0)))
+        chosen = np.flatnonzero(self.length)
+        lengths = self.length[chosen]
+        rows = self.episodes[chosen][np.arange(self.context_size) < lengths[:, None]]
+        tasks = np.repeat(self.tasks[chosen], lengths, axis=0)
+        traj = self.transitions.trajectory(rows[:, None])
+        rows[:, self.transitions.reward] = self.task_family.compute_reward(traj, tasks)[:, 0]
+        success = self.task_family.is_success(traj, tasks)[:, 0]
+        return SolvedTasks(rows, lengths, success, self.best_return[chosen], chosen < self.n_train)

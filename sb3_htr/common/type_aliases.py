@@ -62,6 +62,24 @@ class Context(NamedTuple):
     lengths: th.Tensor
 
 
+class RewardLabels(NamedTuple):
+    """
+    What n of the transitions of a meta-batch would return under each of its M tasks: what a model of rewards learns from.
+
+    :param rows: (n,) int64, which transitions of the RL batch
+    :param success: (n, M) float32, 1 where the transition solves the task
+    :param reward: (n, M) float32, its reward beside the task-free one
+    :param task_free: (n,) float32, the task-free one
+    :param inferred: (M,) float32, 1 for tasks with a reward in their context, from which they can be inferred
+    """
+
+    rows: th.Tensor
+    success: th.Tensor
+    reward: th.Tensor
+    task_free: th.Tensor
+    inferred: th.Tensor
+
+
 class MultiTaskSamples(NamedTuple):
     """
     One meta-batch of M tasks: a context, and N transitions for actor and critics, those of the first task first.
@@ -78,6 +96,7 @@ class MultiTaskSamples(NamedTuple):
     :param task_ids: (M,) int array, the training task whose replay each row of the meta-batch came from
     :param relabelled: (M,) bool array, whether context and RL batch carry rewards of a hindsight task
     :param unrewarded: (M,) bool array, whether no reward of the RL batch has a part that depends on the task
+    :param labels: of some of these transitions, none unless asked for
     """
 
     context: Context
@@ -90,3 +109,4 @@ class MultiTaskSamples(NamedTuple):
     task_ids: np.ndarray
     relabelled: np.ndarray
     unrewarded: np.ndarray
+    labels: RewardLabels | None

@@ -92,10 +92,10 @@ def goal_distance(results: Results, path: Path) -> None:
             return np.array([score(*run) for run in ordered]).reshape(n_seeds(results), -1)
 
         def relative_return(cell: Cell, raw: Any) -> float:
-            return float(raw["returns_search"][:, -1].mean() / optimal_return(**cell.env_kwargs))
+            return float(raw["returns_belief"][:, -1].mean() / optimal_return(**cell.env_kwargs))
 
         band(left, np.array(x), scores(relative_return), colour, "-", variant)
-        success = scores(lambda cell, raw: float(raw["successes_search"][:, -1].mean()))
+        success = scores(lambda cell, raw: float(raw["successes_belief"][:, -1].mean()))
         band(right, np.array(x), success, colour, "-", variant)
     left.axhline(1, color=COLOURS[6], linestyle=":", linewidth=1)
     left.set_ylabel("return of the 20th episode / optimum")
@@ -116,7 +116,7 @@ def relabelling(results: Results, path: Path) -> None:
     groups = {variant: [raw for _, raw in runs] for variant, runs in by_variant(results).items()}
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
     probabilities = sorted(float(variant.removeprefix("K = ")) for variant in groups if variant.startswith("K = "))
-    scores = [np.array([run["returns_search"][:, -1].mean() for run in groups[f"K = {k:g}"]]) for k in probabilities]
+    scores = [np.array([run["returns_belief"][:, -1].mean() for run in groups[f"K = {k:g}"]]) for k in probabilities]
     points = np.array([iqm_interval(score) for score in scores])
     left.plot(probabilities, points[:, 0], "o-", color=COLOURS[0], label="IQM and 95 % interval")
     left.fill_between(probabilities, points[:, 1], points[:, 2], color=COLOURS[0], alpha=0.2, linewidth=0)

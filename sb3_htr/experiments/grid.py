@@ -47,7 +47,7 @@ class Experiment:
     variants: tuple[Variant, ...]
     seeds: int = 5
     eval_freq: int = 10_000
-    explorers: tuple[str, ...] = ("search", "prior")
+    explorers: tuple[str, ...] = ("belief", "prior")
     figure: Callable[[dict[Cell, Path], Path], None] = figures.learning
 
     def cells(self, seeds: int | None = None, scale: float = 1.0) -> list[Cell]:
@@ -122,7 +122,7 @@ EXPERIMENTS: dict[str, Experiment] = {
             for distance, n_steps in ((0.5, 20), (0.75, 20), (1.0, 20), (1.5, 30), (2.0, 40))
             for method in ("htr-ser", "pearl-dense", "pearl-sparse")
         ),
-        explorers=("search",),
+        explorers=("belief",),
         figure=figures.goal_distance,
     ),
     # The first one is what the others are compared with; then the paper's sweep of K, and no relabelling
@@ -137,7 +137,7 @@ EXPERIMENTS: dict[str, Experiment] = {
             Variant("htr-ser", "final state", replay(relabeller={"hindsight_task_strategy": "final"})),
             Variant("htr-ser", "RL batch of the task", replay(relabeller={"rl_batch_source": "task"})),
         ),
-        explorers=("search",),
+        explorers=("belief",),
         figure=figures.relabelling,
     ),
     "precision": Experiment(
@@ -145,6 +145,6 @@ EXPERIMENTS: dict[str, Experiment] = {
         POINT,
         150_000,
         (Variant("htr-ser", "float32"), Variant("htr-ser", "bfloat16", {"matmul_precision": "medium"})),
-        explorers=("search",),
+        explorers=("belief",),
     ),
 }

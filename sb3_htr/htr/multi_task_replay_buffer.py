@@ -12,7 +12,7 @@ from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from sb3_htr.common.checks import check_numbers, check_same_family, family_facts
 from sb3_htr.common.random_state import get_generator_state, set_generator_state
 from sb3_htr.common.settings import make
-from sb3_htr.common.type_aliases import Context, MultiTaskSamples, TaskFamily
+from sb3_htr.common.type_aliases import Context, MultiTaskSamples, RewardLabels, TaskFamily
 from sb3_htr.htr.episode_store import EpisodeStore
 from sb3_htr.htr.relabel import RELABELLERS, Relabeller
 from sb3_htr.htr.transitions import Transitions
@@ -274,7 +274,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         self.discard_open_episodes()
 
     def sample(  # type: ignore[override]
-        self, batch_size: int, *, meta_batch_size: int = 16, context_size: int = 64
+        self, batch_size: int, *, meta_batch_size: int = 16, context_size: int = 64, n_labelled: int = 0
     ) -> MultiTaskSamples:
         """
         Draw a meta-batch: tasks with replacement (as PEARL's reference does), and for each of them context and RL batch.
@@ -285,6 +285,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         :param batch_size: transitions per task for actor and critics, at most
         :param meta_batch_size: number of tasks, M
         :param context_size: transitions per task for the context, at most
+        :param n_labelled: transitions that are rewarded under all tasks of the meta-batch, at most
         :return: the meta-batch
         :raises ValueError: if no episode is complete yet, or the reward hook returns NaN or infinity
         """
@@ -307,6 +308,10 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             rows = self.episodes.take(virtual)
         else:
             is_hindsight = relabelled[task_of_row]
+            if hindsight.elsewhere:
+                anywhere = len(context) + np.flatnonzero(is_hindsight[len(context) :])
+                anywhere = anywhere[self.relabel_rng.random(len(anywhere)) < hindsight.elsewhere]
+                virtual[anywhere] = self.relabel_rng.integers(len(index.rows), size=len(anywhere))
             rows = self._take(virtual, is_hindsight, hindsight.store)
             if not hindsight.is_relabelled:
                 where = np.flatnonzero(is_hindsight)
@@ -315,6 +320,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             where = np.arange(len(context), len(rows))
             self.write_rewards(rows, where, reward_task[task_of_row[where]], "dense")
         columns = self.transitions
+        labels = self._label(rows[len(context) :], rows[: len(context)], n_context, reward_task, n_labelled)
         data = self.to_torch(rows, copy=False)
         context_rows, rl_rows = data[: len(context)], data[len(context) :]
         unrewarded = rows[len(context) :, columns.reward] == rows[len(context) :, columns.task_free_reward]
@@ -334,7 +340,24 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             task_ids=tasks,
             relabelled=relabelled,
             unrewarded=np.logical_and.reduceat(unrewarded, np.cumsum(n_batch) - n_batch),
+            labels=labels,
         )
+
+    def _label(
+        self, rows: np.ndarray, context: np.ndarray, n_context: np.ndarray, tasks: np.ndarray, n_labelled: int
+    ) -> RewardLabels | None:
+        """Some rows under all tasks; which of the tasks have a reward in their context."""
+        if n_labelled == 0:
+            return None
+        columns = self.transitions
+        chosen = self._rng.permutation(len(rows))[:n_labelled]
+        traj = columns.trajectory(rows[chosen])
+        reward = self.task_family.compute_reward(traj, tasks) - traj.task_free_reward
+        rewarded = context[:, columns.reward] != context[:, columns.task_free_reward]
+        inferred = np.logical_or.reduceat(rewarded, np.cumsum(n_context) - n_context)
+        labels = (chosen, self.task_family.is_success(traj, tasks).T, reward.T, traj.task_free_reward, inferred)
+        dtypes = (np.int64, *[np.float32] * 4)
+        return RewardLabels(*(self.to_torch(x.astype(dtype)) for x, dtype in zip(labels, dtypes, strict=True)))
 
     def _take(self, virtual: np.ndarray, is_hindsight: np.ndarray, store: EpisodeStore) -> np.ndarray:
         """(n, width), copies of virtual rows, some of which are of another store than the buffer's own."""

@@ -27,7 +27,7 @@ from sb3_htr.adaptation.evaluation import run_adaptation
 from sb3_htr.adaptation.explorers import Explorer, to_explorer
 from sb3_htr.adaptation.knowledge import LatentKnowledge
 from sb3_htr.adaptation.loop import adaptation_steps
-from sb3_htr.adaptation.task_bank import MAX_TASKS, TaskBank
+from sb3_htr.adaptation.task_bank import TaskBank
 from sb3_htr.common import checks
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.progress import MetaProgressBarCallback
@@ -131,7 +131,7 @@ class OffPolicyMetaAlgorithm(SAC):
         else:
             self._setup_replay(self.env)
             super()._setup_model()
-        self.knowledge = LatentKnowledge(self.policy.latent_dim, MAX_TASKS).to(self.device)
+        self.knowledge = LatentKnowledge(self.policy.latent_dim).to(self.device)
         self._introduce_policy()
 
     def _setup_replay(self, env: VecEnv) -> None:
@@ -149,7 +149,7 @@ class OffPolicyMetaAlgorithm(SAC):
             max_episode_steps=checks.get_max_episode_steps(env),
             **self.replay_buffer_kwargs,
         )
-        self.task_bank = TaskBank(family, self.replay_buffer.transitions)
+        self.task_bank = TaskBank(family, self.replay_buffer.transitions, self.context_size, self.seed)
         self.replay_buffer.episode_listeners.append(self.task_bank.on_episode)
 
     def _introduce_policy(self) -> None:
@@ -259,7 +259,7 @@ class OffPolicyMetaAlgorithm(SAC):
             # In each rollout: a sparse reward can go unseen for many, and the env may be another one than before
             replay_buffer.check_reward_hook(self.task_bank.new)
             self.task_bank.update()
-            self.logger.record("rollout/train_tasks_reached", len(self.task_bank.solved))
+            self.logger.record("rollout/train_tasks_reached", self.task_bank.n_train_solved)
             callback.on_rollout_end()
             self._n_rollouts += 1
             if log_interval is not None and self._n_rollouts % log_interval == 0:
@@ -276,7 +276,7 @@ class OffPolicyMetaAlgorithm(SAC):
         assert isinstance(obs, np.ndarray)
         checks.check_task_ids(env)
         replay_buffer.discard_open_episodes()
-        adaptation = self.start_adaptation(env.num_envs, self.train_explorer)
+        adaptation = self.start_adaptation(env.num_envs, self.train_explorer, is_training=True)
         act = partial(self._explore, adaptation, learning_starts)
         steps = adaptation_steps(env, adaptation, self.n_episodes_per_task, self.policy.unscale_action, act, obs)
         while (step := self._next_step(steps, tasks)) is not None:
@@ -327,7 +327,7 @@ class OffPolicyMetaAlgorithm(SAC):
         :param means: (n, latent_dim), posterior means of recent meta-batches
         """
         assert self.task_bank is not None
-        self.knowledge.learn(self.policy, means, self.task_bank, self.context_size)
+        self.knowledge.learn(self.policy, means, self.task_bank)
 
     # Meta-test
 
@@ -336,15 +336,17 @@ class OffPolicyMetaAlgorithm(SAC):
         n_envs: int,
         explorer: Explorer | dict[str, Any] | str | None = None,
         generator: th.Generator | None = None,
+        is_training: bool = False,
     ) -> Adaptation:
         """
         :param n_envs: number of tasks to adapt to side by side
         :param explorer: an explorer, its name, or its name and settings; the model's own by default
         :param generator: source of randomness; torch's global one by default
+        :param is_training: whether infos tell which part of a reward depends on no task
         :return: chooses z and takes in what happens
         """
         chosen = self.explorer if explorer is None else to_explorer(explorer)
-        return Adaptation(self.policy, self.knowledge, chosen, n_envs, self.context_size, generator)
+        return Adaptation(self.policy, self.knowledge, chosen, n_envs, self.context_size, generator, is_training)
 
     def adapt(
         self,

@@ -9,11 +9,15 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from sb3_htr.adaptation.explorers import Explorer
 from sb3_htr.common.checks import check_numbers
 from sb3_htr.common.matmul import PRECISIONS, matmul_precision
+from sb3_htr.common.type_aliases import MultiTaskSamples
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.pearl.divergence import PosteriorWatch, check_finite
 from sb3_htr.pearl.encoder import ContextEncoder, kl_to_prior
 from sb3_htr.pearl.off_policy_meta_algorithm import OffPolicyMetaAlgorithm
 from sb3_htr.pearl.policies import LatentCritic, MlpPolicy, PEARLPolicy
+
+# Transitions of a meta-batch that the reward model learns from, each under all its tasks
+N_LABELLED = 256
 
 
 class PEARL(OffPolicyMetaAlgorithm):
@@ -47,6 +51,8 @@ class PEARL(OffPolicyMetaAlgorithm):
         episode (PEARL's reference: 1024)
     :param kl_coef: weight of the KL divergence of the posterior from N(0, I), summed over z's dimensions and averaged over
         tasks, beside the critics' squared errors averaged over transitions (PEARL's reference, in these units: 0.0016)
+    :param reward_coef: weight of the losses of the reward model, which shape z as well: z must tell tasks apart. By
+        measurement, on a two-link arm (one seed): .91 of the tasks are solved at 0, .99 and more at .5 and 2
     :param n_tasks_per_rollout: training tasks per rollout (PEARL's reference: 10)
     :param n_episodes_per_task: episodes on each of them
     :param explorer: chooses z at meta-test: an :class:`sb3_htr.adaptation.Explorer`, its name, or its name and settings,
@@ -89,9 +95,10 @@ class PEARL(OffPolicyMetaAlgorithm):
         meta_batch_size: int = 64,
         context_size: int = 20,
         kl_coef: float = 0.001,
+        reward_coef: float = 2.0,
         n_tasks_per_rollout: int = 20,
         n_episodes_per_task: int = 10,
-        explorer: Explorer | dict[str, Any] | str = "search",
+        explorer: Explorer | dict[str, Any] | str = "belief",
         train_explorer: Explorer | dict[str, Any] | str = "aggregate",
         matmul_precision: str = "highest",
         stats_window_size: int = 100,
@@ -109,6 +116,7 @@ class PEARL(OffPolicyMetaAlgorithm):
             gradient_steps=(gradient_steps, 1, infinity),
             target_update_interval=(target_update_interval, 1, infinity),
             kl_coef=(kl_coef, 0.0, infinity),
+            reward_coef=(reward_coef, 0.0, infinity),
             gamma=(gamma, 0.0, 1.0),
             tau=(tau, 0.0, 1.0),
         )
@@ -145,6 +153,7 @@ class PEARL(OffPolicyMetaAlgorithm):
         )
         self.meta_batch_size = meta_batch_size
         self.kl_coef = kl_coef
+        self.reward_coef = reward_coef
         self.matmul_precision = matmul_precision
         self._posterior_watch = PosteriorWatch()
         if _init_setup_model:
@@ -153,6 +162,7 @@ class PEARL(OffPolicyMetaAlgorithm):
     def _create_aliases(self) -> None:
         super()._create_aliases()
         self.encoder = self.policy.encoder
+        self.reward_model = self.policy.reward_model
 
     def train(self, gradient_steps: int, batch_size: int = 16) -> None:
         """
@@ -163,7 +173,7 @@ class PEARL(OffPolicyMetaAlgorithm):
         """
         assert self.replay_buffer is not None
         self.policy.set_training_mode(True)
-        optimizers = [self.actor.optimizer, self.critic.optimizer, self.encoder.optimizer]
+        optimizers = [network.optimizer for network in (self.actor, self.critic, self.encoder, self.reward_model)]
         if self.ent_coef_optimizer is not None:
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
@@ -182,28 +192,33 @@ class PEARL(OffPolicyMetaAlgorithm):
     def _update(self, batch_size: int) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """One update of all networks. Posterior means (M, latent_dim), and what to log."""
         assert self.replay_buffer is not None
-        data = self.replay_buffer.sample(batch_size, meta_batch_size=self.meta_batch_size, context_size=self.context_size)
+        sizes = {"meta_batch_size": self.meta_batch_size, "context_size": self.context_size, "n_labelled": N_LABELLED}
+        data = self.replay_buffer.sample(batch_size, **sizes)
         # Each task has the same weight in a mean over transitions
         weight = (1.0 / (self.meta_batch_size * data.lengths)).repeat_interleave(data.lengths, output_size=len(data.rewards))
-        # One backward pass through the encoder: it learns from the critics' errors and the KL term
+        # One backward pass through the encoder: it learns from the critics' errors, the KL term and the reward model's errors
         mean, variance = self.policy.infer(data.context)
         z = mean + variance.sqrt() * th.randn_like(mean)
         kl = kl_to_prior(mean, variance).mean()
         z_rows = z.repeat_interleave(data.lengths, dim=0, output_size=len(data.rewards))
-        obs_z = th.cat([self.policy.normalize(data.observations), z_rows], dim=1)
+        obs, next_obs = self.policy.normalize(data.observations), self.policy.normalize(data.next_observations)
+        obs_z = th.cat([obs, z_rows], dim=1)
         ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp()
         with th.no_grad():
-            next_obs_z = th.cat([self.policy.normalize(data.next_observations), z_rows], dim=1)
+            next_obs_z = th.cat([next_obs, z_rows], dim=1)
             next_actions, next_log_prob = self.policy.sample_actions(next_obs_z)
             next_q = self.critic_target(next_obs_z, next_actions).amin(dim=0) - ent_coef * next_log_prob
             target_q = data.rewards + (1 - data.dones) * self.gamma * next_q
         q = self.critic(obs_z, data.actions)
         critic_loss = ((q - target_q).square() * weight).sum()
-        self.critic.optimizer.zero_grad()
-        self.encoder.optimizer.zero_grad()
-        (critic_loss + self.kl_coef * kl).backward()
-        self.critic.optimizer.step()
-        self.encoder.optimizer.step()
+        success_loss, reward_loss, task_free_loss = self._reward_losses(data, obs, next_obs, z)
+        learning = (self.critic.optimizer, self.encoder.optimizer, self.reward_model.optimizer)
+        for optimizer in learning:
+            optimizer.zero_grad()
+        reward_losses = success_loss + reward_loss + task_free_loss
+        (critic_loss + self.kl_coef * kl + self.reward_coef * reward_losses).backward()
+        for optimizer in learning:
+            optimizer.step()
 
         # The actor sees z, but does not shape it
         obs_z = obs_z.detach()
@@ -227,6 +242,9 @@ class PEARL(OffPolicyMetaAlgorithm):
             "critic_loss": critic_loss.detach(),
             "actor_loss": actor_loss.detach(),
             "kl_divergence": kl.detach(),
+            "success_loss": success_loss.detach(),
+            "reward_loss": reward_loss.detach(),
+            "task_free_loss": task_free_loss.detach(),
             "ent_coef": ent_coef.detach().mean(),
             "posterior_std": variance.detach().sqrt().mean(),
             "q_value": (q.detach().mean(dim=0) * weight).sum(),
@@ -238,9 +256,19 @@ class PEARL(OffPolicyMetaAlgorithm):
             listener()
         return mean.detach(), log
 
+    def _reward_losses(
+        self, data: MultiTaskSamples, obs: th.Tensor, next_obs: th.Tensor, z: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """Of success, of the reward of a success, and of the task-free part."""
+        labels = data.labels
+        assert labels is not None
+        obs, next_obs, actions = obs[labels.rows], next_obs[labels.rows], data.actions[labels.rows]
+        task_free_error = self.reward_model.task_free(obs, actions, next_obs) - labels.task_free
+        return *self.reward_model.losses(next_obs, z, labels), task_free_error.square().mean()
+
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "encoder", "_posterior_watch"]
+        return [*super()._excluded_save_params(), "encoder", "reward_model", "_posterior_watch"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()
-        return [*state_dicts, "encoder.optimizer"], variables
+        return [*state_dicts, "encoder.optimizer", "reward_model.optimizer"], variables

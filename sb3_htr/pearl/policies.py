@@ -18,6 +18,7 @@ from sb3_htr.common.linear import Linear, with_fast_linear
 from sb3_htr.common.normalizer import ObservationNormalizer
 from sb3_htr.common.type_aliases import Context
 from sb3_htr.pearl.encoder import ContextEncoder
+from sb3_htr.pearl.reward_model import RewardModel
 
 
 class LatentCritic(BaseModel):
@@ -63,7 +64,7 @@ class LatentCritic(BaseModel):
 
 class PEARLPolicy(SACPolicy):
     """
-    Actor, critics and context encoder of PEARL.
+    Actor, critics and context encoder of PEARL, and a model of rewards.
 
     :param observation_space: Box, without the task variable
     :param action_space: Box
@@ -129,6 +130,13 @@ class PEARLPolicy(SACPolicy):
         self.encoder = self.encoder_class(self.context_dim, self.latent_dim, self.encoder_arch, self.activation_fn)
         self.encoder.optimizer = self.optimizer_class(
             self.encoder.parameters(),
+            lr=lr_schedule(1),  # type: ignore[call-arg]
+            **self.optimizer_kwargs,
+        )
+        action_dim = self.context_dim - self.obs_dim - 1
+        self.reward_model = RewardModel(self.obs_dim, action_dim, self.latent_dim)
+        self.reward_model.optimizer = self.optimizer_class(
+            self.reward_model.parameters(),
             lr=lr_schedule(1),  # type: ignore[call-arg]
             **self.optimizer_kwargs,
         )
@@ -230,6 +238,17 @@ class PEARLPolicy(SACPolicy):
         :return: mean and variance (n_tasks, latent_dim) of the posteriors over z
         """
         return self.encoder.posterior(self.extend_posterior(self.encoder.empty(len(context.lengths)), context))
+
+    def values(self, obs: np.ndarray, z: th.Tensor) -> th.Tensor:
+        """
+        :param obs: (n, obs_dim)
+        :param z: (n, k, latent_dim)
+        :return: (n, k), the smaller critic's value of acting with each z
+        """
+        n, k, _ = z.shape
+        normal = self.normalize(th.as_tensor(obs, dtype=th.float32, device=self.device))
+        obs_z = th.cat([normal.repeat_interleave(k, dim=0), z.reshape(n * k, -1)], dim=1)
+        return self.critic(obs_z, self._act(obs_z, deterministic=True)).amin(dim=0).reshape(n, k)
 
     def _act(self, obs_z: th.Tensor, deterministic: bool) -> th.Tensor:
         mean, log_std = self._gaussian(obs_z)

@@ -1,11 +1,17 @@
 from sb3_htr.adaptation.explorers.aggregate import Aggregate
 from sb3_htr.adaptation.explorers.base import Explorer
+from sb3_htr.adaptation.explorers.belief import Belief
+from sb3_htr.adaptation.explorers.learned_prior import LearnedPrior
 from sb3_htr.adaptation.explorers.prior import Prior
-from sb3_htr.adaptation.explorers.search import Search
 from sb3_htr.common.settings import make
 
 # For YAML files
-EXPLORERS: dict[str, type[Explorer]] = {"prior": Prior, "aggregate": Aggregate, "search": Search}
+EXPLORERS: dict[str, type[Explorer]] = {
+    "belief": Belief,
+    "prior": Prior,
+    "learned-prior": LearnedPrior,
+    "aggregate": Aggregate,
+}
 
 
 def to_explorer(explorer: object) -> Explorer:
@@ -18,4 +24,4 @@ def to_explorer(explorer: object) -> Explorer:
     return make("explorer", explorer, EXPLORERS, Explorer)
 
 
-__all__ = ["EXPLORERS", "Aggregate", "Explorer", "Prior", "Search", "to_explorer"]
+__all__ = ["EXPLORERS", "Aggregate", "Belief", "Explorer", "LearnedPrior", "Prior", "to_explorer"]

@@ -11,7 +11,7 @@ from sb3_htr.common.checks import check_numbers
 if TYPE_CHECKING:
     from sb3_htr.adaptation.adaptation import Step
 
-# A return without its task-free part is that much above 0, or it is 0: the difference of two sums of float32
+# Of returns, which are sums of float32
 ROUNDING = 1e-5
 # What an episode counts for that found the reward, but with more than one z, so that it cannot be repeated with one
 FOUND = 2 * ROUNDING

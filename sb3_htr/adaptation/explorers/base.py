@@ -43,6 +43,13 @@ class Explorer(ABC):
     def start(self) -> None:
         """Set :attr:`z` for the first episodes."""
 
+    def look(self, obs: np.ndarray) -> None:
+        """
+        Called before each step, with what is about to be acted on; may set :attr:`z` anew.
+
+        :param obs: (n_envs, obs_dim)
+        """
+
     @abstractmethod
     def observe(self, step: "Step") -> None:
         """

@@ -23,6 +23,8 @@ class HindsightDraw(NamedTuple):
     :param tasks: (m, task_dim) float32, the hindsight tasks
     :param is_relabelled: whether the stored rewards are those of the hindsight tasks already; if not, the buffer computes them
         for what it draws
+    :param elsewhere: share of the transitions of the RL batches that are drawn from all of the replay instead, whatever their
+        task; only where the buffer computes the rewards
     """
 
     store: EpisodeStore
@@ -30,6 +32,7 @@ class HindsightDraw(NamedTuple):
     batch: np.ndarray
     tasks: np.ndarray
     is_relabelled: bool
+    elsewhere: float = 0.0
 
 
 class Relabeller(ABC):

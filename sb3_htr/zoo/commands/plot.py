@@ -64,7 +64,8 @@ def adapt(agent: TrainedAgent, args: argparse.Namespace) -> Adapted:
     env.set_options([{"task": task} for task in tasks])
     adaptation = model.start_adaptation(len(tasks), args.explorer, th.Generator().manual_seed(args.seed))
     record = run_adaptation(model.policy, env, adaptation, args.n_episodes, deterministic=not args.stochastic)
-    known_z = model.knowledge.known_tasks().z
+    particles = model.knowledge.particles()
+    known_z = particles.z[particles.is_train].numpy()
     radius = getattr(family, "goal_radius", None)
     explorer = adaptation.explorer.name
     start = start_position(agent.make_env()) if tasks.shape[1] == 2 else None

@@ -1,0 +1,125 @@
+"""A belief over tasks, by which an unknown one is searched for and exploited."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch as th
+
+from sb3_htr.adaptation.explorers.particles import ParticleExplorer
+from sb3_htr.common.checks import check_numbers
+
+if TYPE_CHECKING:
+    from sb3_htr.adaptation.adaptation import Step
+
+# z that are compared by their values, those that promise most: fewer change nothing that was measured
+N_COMPARED = 32
+# z is chosen anew so often in an episode, at most
+N_CHOICES = 40
+# A value below says nothing about how far a task is
+MIN_VALUE = 1e-3
+
+
+@dataclass
+class Belief(ParticleExplorer):
+    """
+    The explorer that is the default at meta-test.
+
+    Before the first reward, z is that of the particle whose episode would earn most, and soonest: what the belief expects its
+    rewarded steps to earn, times the critics' value of going there from here; chosen anew within an episode. After it, each
+    episode has one z, the one that promises the largest return: of a particle, under the same belief; of the best episode so
+    far, what it returned; and the encoder's posterior mean, given a new best episode, is tried once.
+
+    :param margin: a particle must promise so many times what the best episode returned, to be tried in its place
+    """
+
+    margin: float = 1.02
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_numbers(margin=(self.margin, 0.0, float("inf")))
+
+    def start(self) -> None:
+        super().start()
+        n_envs = len(self.z)
+        # Whether more than one z was acted with in the running episode
+        self._turned = np.zeros(n_envs, dtype=bool)
+        self._at_start = np.ones(n_envs, dtype=bool)
+        self._n_steps = np.zeros(n_envs, dtype=np.int64)
+        self._every = 1
+        # Of all episodes, and of those with one z
+        self._best_return = np.zeros(n_envs)
+        self._best_z = np.zeros_like(self.z)
+        self._best_z_return = np.zeros(n_envs)
+        # Particles whose return is known, and the one that is acted with, -1 for none
+        self._tried = np.zeros((n_envs, len(self.particles.z)), dtype=bool)
+        self._particle = np.full(n_envs, -1)
+        # The encoder's word on a new best episode
+        self._proposal = np.zeros_like(self.z)
+        self._has_proposal = np.zeros(n_envs, dtype=bool)
+
+    def exploring(self) -> np.ndarray:
+        return np.asarray(self._best_return <= 0)
+
+    def final_z(self) -> np.ndarray:
+        """
+        :return: (n_envs, latent_dim), z of the best episode, or, where none was rewarded, the one to be acted with next
+        """
+        return np.where((self._best_z_return > 0)[:, None], self._best_z, self.z)
+
+    def look(self, obs: np.ndarray) -> None:
+        exploring = self.exploring()
+        due = self._at_start | (self._n_steps % self._every == 0)
+        self._search(np.flatnonzero(exploring & due), obs)
+        self._exploit(np.flatnonzero(~exploring & self._at_start))
+        self._at_start[:] = False
+
+    def _search(self, envs: np.ndarray, obs: np.ndarray) -> None:
+        """What earns most, and soonest."""
+        if len(envs) == 0:
+            return
+        n_compared = min(N_COMPARED, len(self.particles.z))
+        with th.no_grad():
+            gain, index = (self.weights(envs) @ self.particles.gain.T).topk(n_compared, dim=1)
+            z = self.particles.z[index]
+            promise = gain * self.adaptation.policy.values(obs[envs], z).clamp(min=MIN_VALUE)
+        chosen = z[th.arange(len(envs)), promise.argmax(dim=1)].cpu().numpy()
+        self._turned[envs] |= ~self._at_start[envs] & (chosen != self.z[envs]).any(axis=1)
+        self.z[envs] = chosen
+
+    def _exploit(self, envs: np.ndarray) -> None:
+        """What returns most."""
+        if len(envs) == 0:
+            return
+        returns = (self.weights(envs) @ self.particles.returns.T).cpu().numpy()
+        returns[self._tried[envs]] = 0
+        particle = returns.argmax(axis=1)
+        self.z[envs], self._particle[envs] = self.particles.z[particle].cpu().numpy(), particle
+        best = envs[returns.max(axis=1) < self.margin * self._best_z_return[envs]]
+        self.z[best], self._particle[best] = self._best_z[best], -1
+        proposed = envs[self._has_proposal[envs]]
+        self.z[proposed], self._particle[proposed] = self._proposal[proposed], -1
+        self._has_proposal[proposed] = False
+
+    def observe(self, step: "Step") -> None:
+        self.infer(step)
+        self._n_steps += 1
+        ended = np.flatnonzero(step.dones)
+        if len(ended):
+            self._every = max(self._every, int(self._n_steps.max()) // N_CHOICES)
+            self._end(ended)
+
+    def _end(self, envs: np.ndarray) -> None:
+        """Learn from the episodes that end."""
+        episode_return = self.adaptation.episode_return
+        returns, particle = episode_return[envs], self._particle[envs]
+        self._tried[envs[particle >= 0], particle[particle >= 0]] = True
+        better = envs[returns > self.margin * self._best_return[envs] + 1e-5]
+        self._best_return[envs] = np.maximum(self._best_return[envs], returns)
+        repeatable = envs[~self._turned[envs] & (returns > self._best_z_return[envs] + 1e-5)]
+        self._best_z[repeatable], self._best_z_return[repeatable] = self.z[repeatable], episode_return[repeatable]
+        self.adaptation.infer(better, keep=False)
+        self._proposal[better] = self.adaptation.posterior(better)[0]
+        self._has_proposal[better] = True
+        self._turned[envs], self._at_start[envs] = False, True
+        self._n_steps[envs], self._particle[envs] = 0, -1

@@ -1,0 +1,53 @@
+"""PEARL's protocol with a prior that was learned."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch as th
+
+from sb3_htr.adaptation.explorers.particles import ParticleExplorer
+from sb3_htr.common.checks import check_numbers
+
+if TYPE_CHECKING:
+    from sb3_htr.adaptation.adaptation import Step
+
+
+@dataclass
+class LearnedPrior(ParticleExplorer):
+    """
+    Posterior sampling, as PEARL has it, with an empirical prior in place of N(0, I): the posterior means of solved training
+    tasks. z is drawn from it for a fixed number of episodes, and then from the posterior over all episodes, their misses
+    included. One z an episode.
+
+    :param n_exploration_episodes: episodes before the posterior is used (PEARL's reference, num_exp_traj_eval: 5)
+    """
+
+    n_exploration_episodes: int = 5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.name = "learned-prior"
+        check_numbers(n_exploration_episodes=(self.n_exploration_episodes, 0, float("inf")))
+
+    def start(self) -> None:
+        super().start()
+        is_train = self.particles.is_train
+        self._prior = th.where(is_train, 0.0, -th.inf) if is_train.any() else self.particles.log_prior
+        self.log_weights[:] = self._prior
+        self._draw(np.arange(len(self.z)))
+
+    def observe(self, step: "Step") -> None:
+        self.infer(step)
+        ended = np.flatnonzero(step.dones)
+        if len(ended):
+            self._draw(ended)
+
+    def exploring(self) -> np.ndarray:
+        return np.asarray(self.adaptation.n_episodes < self.n_exploration_episodes)
+
+    def _draw(self, envs: np.ndarray) -> None:
+        exploring = th.as_tensor(self.exploring()[envs], device=self._prior.device)[:, None]
+        weights = th.where(exploring, self._prior.softmax(dim=0), self.weights(envs))
+        particle = th.multinomial(weights.cpu(), 1, generator=self.adaptation.generator)[:, 0]
+        self.z[envs] = self.particles.z.cpu()[particle].numpy()

@@ -1,0 +1,92 @@
+"""Bayes' rule over particles."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch as th
+
+from sb3_htr.adaptation.explorers.base import Explorer
+from sb3_htr.adaptation.knowledge import Particles
+from sb3_htr.common.checks import check_numbers
+
+if TYPE_CHECKING:
+    from sb3_htr.adaptation.adaptation import Step
+
+# Draws from the prior in place of particles, before meta-training has solved a task
+N_DRAWS = 32
+# Rewards that are further than so many deviations from what is expected say no more than these
+OUTLIER = 3.0
+
+
+@dataclass
+class ParticleExplorer(Explorer):
+    """
+    A belief over tasks that meta-training has solved, training tasks and hindsight tasks: every step multiplies the weight of
+    each by what the reward model says of the step's reward under that task.
+
+    Nothing else is used than observations, actions and rewards.
+
+    :param doubt: probability of a success where the model excludes one, and of none where it is sure of one
+    :param temperature: power of each step's likelihood: steps of an episode are not independent
+    :param noise: smallest standard deviation of rewards around those expected, relative to the mean reward of a success
+    """
+
+    doubt: float = 0.02
+    temperature: float = 0.5
+    noise: float = 0.1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_numbers(
+            doubt=(self.doubt, 0.0, 0.5),
+            temperature=(self.temperature, 0.0, 1.0),
+            noise=(self.noise, 0.0, float("inf")),
+        )
+
+    def start(self) -> None:
+        adaptation = self.adaptation
+        self.particles = adaptation.knowledge.particles()
+        if len(self.particles.z) == 0:
+            z = th.as_tensor(adaptation.noise(N_DRAWS), device=adaptation.policy.device)
+            eye, flat = th.eye(N_DRAWS, device=z.device), th.zeros(N_DRAWS, device=z.device)
+            self.particles = Particles(z, eye, eye, flat, flat.bool())
+        with th.no_grad():
+            self._tasks = adaptation.policy.reward_model.task_tower(self.particles.z)
+        self.log_weights = self.particles.log_prior.repeat(adaptation.n_envs, 1)
+        self.z = np.zeros((adaptation.n_envs, adaptation.policy.latent_dim), dtype=np.float32)
+
+    def weights(self, envs: np.ndarray) -> th.Tensor:
+        """
+        :param envs: (k,) int
+        :return: (k, n), probability of each particle
+        """
+        return self.log_weights[envs].softmax(dim=1)
+
+    def deviation(self) -> np.ndarray:
+        z, weights = self.particles.z, self.log_weights.softmax(dim=1)
+        variance = weights @ z.square() - (weights @ z).square()
+        return np.asarray(variance.clamp(min=0).sqrt().cpu().numpy())
+
+    def infer(self, step: "Step") -> None:
+        """
+        One step of Bayes' rule.
+
+        :param step: what each env did
+        """
+        policy = self.adaptation.policy
+        model, device = policy.reward_model, policy.device
+        with th.no_grad():
+            next_obs, reward = (
+                th.as_tensor(x, dtype=th.float32, device=device) for x in (step.next_observations, self.adaptation.task_reward)
+            )
+            rewarded = reward > 0
+            states = model.state_tower(policy.normalize(next_obs))
+            chance = model.success_logits(states, self._tasks).sigmoid().clamp(self.doubt, 1 - self.doubt)
+            log_likelihood = th.where(rewarded[:, None], chance, 1 - chance).log()
+            if rewarded.any():
+                deviation = th.maximum(model.deviation, self.noise * model.scale)
+                error = (reward[:, None] - model.success_rewards(states, self._tasks)) / deviation
+                surprise = 0.5 * error.clamp(-OUTLIER, OUTLIER).square()
+                log_likelihood = log_likelihood - th.where(rewarded[:, None], surprise, 0.0)
+        self.log_weights += self.temperature * log_likelihood
