@@ -6,7 +6,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from sb3_htr.common.resume import n_steps_done
-from sb3_htr.zoo.run.agents import RECORD, find_run, read_record
+from sb3_htr.zoo.run.agents import RECORD, file_stem, find_run, read_record
 from sb3_htr.zoo.run.manager import run_rl_zoo
 from sb3_htr.zoo.run.memory import keep_freed_memory
 from sb3_htr.zoo.run.method import get_method
@@ -62,7 +62,7 @@ def main(argv: Sequence[str]) -> None:
         run = find_run(args.resume)
         record = read_record(run / RECORD)
         planned = record["n_timesteps"] + further.n_timesteps
-        if n_steps_done(run) >= planned and (run / f"{record['env_id']}.zip").exists():
+        if n_steps_done(run) >= planned and (run / f"{file_stem(record['env_id'])}.zip").exists():
             print(f"{run} is finished, after {planned:,} env steps. To train further: sb3-htr train --resume {run} -n STEPS")
             return
         arguments, args.method = [*record["arguments"], "--seed", str(record["seed"])], record["method"]
