@@ -87,6 +87,8 @@ def model_card(record: dict[str, Any], scores: dict[str, AdaptationRecord], repo
     data = ModelCardData(library_name="stable-baselines3", tags=[env_id, *TAGS], model_name=name, eval_results=[result])
     kwargs = "".join(f", {key}={value!r}" for key, value in record["env_kwargs"].items())
     imports = "".join(f"import {package}  # registers the env\n" for package in record["gym_packages"] or ["htr_envs"])
+    if env_id.startswith("HiddenGoal/") and not record["gym_packages"]:
+        imports += f'htr_envs.hide_goal("{env_id.partition("/")[2]}")  # registers the family\n'
     file = f"{file_stem(env_id)}.zip"
     path = f'"{file}"'
     if repo_id is not None:
