@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
-EXTRAS := zoo,plots,video,mujoco,tensorboard,postgresql,docs,dev
+EXTRAS := zoo,plots,video,mujoco,robotics,panda,metaworld,tensorboard,postgresql,docs,dev
 BENCHMARKS := $(filter-out benchmarks/_%,$(wildcard benchmarks/*.py))
 
 .DEFAULT_GOAL := help

@@ -7,7 +7,7 @@ import gymnasium
 import matplotlib.pyplot as plt
 import numpy as np
 
-from htr_envs import PointRobotEnv, TargetSpeedEnv
+from htr_envs import HiddenGoalEnv, PointRobotEnv, TargetSpeedEnv
 from htr_envs.ant import AntEnv
 from htr_envs.wheeled import WheeledEnv
 
@@ -36,7 +36,13 @@ def picture(env_id: str, task: list[float], actions: np.ndarray) -> np.ndarray:
 
 # Docstrings of envs are Markdown, as in gymnasium: the pages in envs/ include these copies
 (HERE / "_build").mkdir(exist_ok=True)
-pages = {"point_robot": PointRobotEnv, "target_speed": TargetSpeedEnv, "wheeled": WheeledEnv, "ant": AntEnv}
+pages = {
+    "point_robot": PointRobotEnv,
+    "target_speed": TargetSpeedEnv,
+    "wheeled": WheeledEnv,
+    "ant": AntEnv,
+    "hidden_goal": HiddenGoalEnv,
+}
 for name, env in pages.items():
     (HERE / "_build" / f"{name}.md").write_text(inspect.cleandoc(env.__doc__ or ""))
 # To the ring, then along it: the velocity is multiplied by 0.95 and gets 0.2 times the thrust

@@ -7,7 +7,6 @@ of copies, and a state alone determines the next one, so single and batched envs
 from __future__ import annotations
 
 import os
-import sys
 from abc import abstractmethod
 from typing import Any, ClassVar
 
@@ -17,6 +16,7 @@ from gymnasium.error import DependencyNotInstalled
 from numpy.typing import NDArray
 
 from htr_envs.dynamics import Dynamics
+from htr_envs.headless import open_no_window
 from htr_envs.semicircle_goals import SemicircleGoalFamily
 from htr_envs.task_env import BoolArray, FloatArray
 
@@ -131,9 +131,7 @@ class MujocoDynamics(Dynamics[SemicircleGoalFamily]):
             # imported here: who never renders needs no OpenGL
             from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 
-            if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-                # gymnasium would try to open a window first, which ends the process where there is no screen
-                os.environ.setdefault("MUJOCO_GL", "egl")
+            open_no_window()
             self.model.geom("goal").size[0] = task_family.goal_radius
             data = mujoco.MjData(self.model)  # of its own: a picture changes nothing in the simulation
             self._renderer = MujocoRenderer(self.model, data, dict(CAMERA), FRAME_WIDTH, FRAME_HEIGHT, camera_id=-1), data

@@ -197,7 +197,7 @@ def test_a_meta_batch_may_be_larger_than_the_number_of_tasks(tiny_pearl: MakePEA
             ["--env", ENV_ID, "--trial-id", "9", "--study-name", "s", "--storage", "sqlite:///:memory:"],
             "no study 's' with a trial 9",
         ),
-        (["--env", "Speed-v0", "--gym-packages", "not_there"], "The module not_there is not found: install it"),
+        (["--env", "Speed-v0", "--gym-packages", "not_there"], "needs the module not_there, which is not found: install it"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )

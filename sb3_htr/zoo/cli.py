@@ -35,6 +35,9 @@ EXTRAS = {
     "PIL": "video",
     "imageio_ffmpeg": "video",
     "mujoco": "mujoco",
+    "gymnasium_robotics": "robotics",
+    "panda_gym": "panda",
+    "metaworld": "metaworld",
     "tensorboard": "tensorboard",
     "psycopg": "postgresql",
 }

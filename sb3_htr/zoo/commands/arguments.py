@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from htr_envs.goal_env import find_hidden
 from sb3_htr.adaptation.explorers import EXPLORERS
 from sb3_htr.zoo.run.agents import TrainedAgent, agent_at, agent_for
 from sb3_htr.zoo.run.trust import import_packages, refuse
@@ -105,6 +106,7 @@ def chosen_agent(parser: argparse.ArgumentParser, args: argparse.Namespace, path
     if ":" in agent.env_id and not args.trust:
         raise refuse(agent.path, f"is for the env {agent.env_id!r}")
     import_packages(args.gym_packages, agent.record["gym_packages"], agent.path, args.trust)
+    find_hidden(agent.env_id)
     kwargs = {**agent.record["env_kwargs"], **args.env_kwargs}
     return dataclasses.replace(agent, record={**agent.record, "env_kwargs": kwargs})
 

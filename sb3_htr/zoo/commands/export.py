@@ -96,11 +96,11 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--push-to-hub", metavar="USER/NAME", help="upload; log in with `hf auth login` first")
     parser.add_argument("--private", action="store_true", help="with --push-to-hub: a private repository")
     args, agent = parse(parser, argv)
-    output = args.output or Path("exported") / agent.env_id
+    output = args.output or Path("exported") / agent.stem
     alone = output.suffix == ".zip"
     if alone and (args.push_to_hub or args.film):
         raise ValueError(f"--push-to-hub and --film need a folder, but the output is the file {output}.")
-    file = output if alone else output / f"{agent.env_id}.zip"
+    file = output if alone else output / f"{agent.stem}.zip"
     record = export(agent, file, args.trust)
     print(f"{file}: {file.stat().st_size / 1e6:.2f} MB, of {agent.path}")
     if alone:

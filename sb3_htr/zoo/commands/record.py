@@ -26,7 +26,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--every", type=int, default=1, metavar="N", help="only every N-th frame, for long episodes")
     parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="times as fast as the env (default: 1)")
     args, agent = parse(parser, argv)
-    output = args.output or Path(f"{agent.env_id}.mp4")
+    output = args.output or Path(f"{agent.stem}.mp4")
     if output.suffix not in SUFFIXES:
         raise ValueError(f"{output} has the suffix {output.suffix!r}, expected one of {', '.join(SUFFIXES)}.")
     if args.every < 1 or not args.speed > 0:

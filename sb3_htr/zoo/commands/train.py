@@ -5,8 +5,9 @@ from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
+from htr_envs.goal_env import find_hidden
 from sb3_htr.common.resume import n_steps_done
-from sb3_htr.zoo.run.agents import RECORD, find_run, read_record
+from sb3_htr.zoo.run.agents import RECORD, file_stem, find_run, read_record
 from sb3_htr.zoo.run.manager import run_rl_zoo
 from sb3_htr.zoo.run.memory import keep_freed_memory
 from sb3_htr.zoo.run.method import get_method
@@ -19,6 +20,7 @@ HELP = """sb3-htr train: rl_zoo3's train (its arguments follow) with PEARL and e
 examples:
   sb3-htr train --env SparsePointRobot-v0 -P
   sb3-htr train --env SparsePointRobot-v0 --method htr-ec -f runs --seed 1
+  sb3-htr train --env HiddenGoal/FetchReach-v4
   sb3-htr train --env SparsePointRobot-v0 -params gamma:0.95 "policy_kwargs:{'latent_dim':3}"
   sb3-htr train --resume runs/htr-ser/SparsePointRobot-v0_1
 
@@ -43,7 +45,9 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--trust", action="store_true")
     parser.add_argument("--gym-packages", nargs="+", default=[])
     parser.add_argument("--algo", default="pearl")
+    parser.add_argument("--env")
     args, rest = parser.parse_known_args(argv)
+    env = [] if args.env is None else ["--env", args.env]
     wants_help = bool({"-h", "--help"} & set(rest))
     if wants_help:
         print(HELP)
@@ -56,21 +60,23 @@ def main(argv: Sequence[str]) -> None:
         more = argparse.ArgumentParser(prog="sb3-htr train --resume", add_help=False, allow_abbrev=False)
         more.add_argument("-n", "--n-timesteps", type=int, default=0)
         further, rest = more.parse_known_args(rest)
+        rest += env
         if rest or args.method:
             given = " ".join(rest) or "--method"
             raise ValueError(f"train --resume goes on with the run's own arguments: leave {given} away.")
         run = find_run(args.resume)
         record = read_record(run / RECORD)
         planned = record["n_timesteps"] + further.n_timesteps
-        if n_steps_done(run) >= planned and (run / f"{record['env_id']}.zip").exists():
+        if n_steps_done(run) >= planned and (run / f"{file_stem(record['env_id'])}.zip").exists():
             print(f"{run} is finished, after {planned:,} env steps. To train further: sb3-htr train --resume {run} -n STEPS")
             return
         arguments, args.method = [*record["arguments"], "--seed", str(record["seed"])], record["method"]
         arguments += ["-n", str(planned)]
         check_arguments(arguments, run / RECORD, args.trust)
         import_packages(args.gym_packages, record["gym_packages"], run / RECORD, args.trust)
+        find_hidden(record["env_id"])
     else:
-        if not wants_help and not any(argument.split("=")[0] == "--env" for argument in rest):
+        if not wants_help and not env:
             raise ValueError("--env is missing: give the id of a task env, as in `sb3-htr train --env SparsePointRobot-v0`.")
         # Later arguments win, so these are defaults. One thread: two runs on two cores must not fight for them.
         defaults = ["--algo", "pearl", "-conf", str(hyperparams_file()), "--num-threads", "1", "--save-freq", "20000"]
@@ -78,7 +84,9 @@ def main(argv: Sequence[str]) -> None:
         for before, word in list(pairwise(rest)):
             if before in CONF and Path(word).exists():
                 rest[rest.index(word)] = str(Path(word).resolve())  # wherever the run goes on from
-        arguments = [*defaults, *rest, *packages]
+        arguments = [*defaults, *env, *rest, *packages]
+        import_packages(args.gym_packages)
+        find_hidden(args.env or "")
     keep_freed_memory()
     try:
         run_rl_zoo("sb3-htr train", arguments, args.method, run, args.trust)

@@ -41,6 +41,11 @@ class TrainedAgent:
         return str(self.record["env_id"])
 
     @property
+    def stem(self) -> str:
+        """Its env in names of files."""
+        return file_stem(self.env_id)
+
+    @property
     def method(self) -> str:
         """Name of the method that it was trained by."""
         return str(self.record.get("method", "unknown"))
@@ -98,6 +103,14 @@ class TrainedAgent:
         return make_task_vec_env(self.env_id, n_envs, env_kwargs=self.record["env_kwargs"])
 
 
+def file_stem(env_id: str) -> str:
+    """
+    :param env_id: id of an env, with a namespace or a module before it perhaps
+    :return: how rl_zoo3 writes it in names of files
+    """
+    return env_id.rpartition(":")[2].replace("/", "-")
+
+
 def read_record(path: Path, content: bytes | None = None) -> dict[str, Any]:
     """
     :param path: of the record, or of the file that it is in
@@ -144,7 +157,7 @@ def find_model(run: Path, env_id: str, which: str) -> Path:
     :return: model file; the other one where the run has only that yet
     :raises FileNotFoundError: if it has neither
     """
-    best, last = run / "best_model.zip", run / f"{env_id}.zip"
+    best, last = run / "best_model.zip", run / f"{file_stem(env_id)}.zip"
     for path in (best, last) if which == "best" else (last, best):
         if path.exists():
             return path
@@ -191,7 +204,7 @@ def agent_for(
 ) -> TrainedAgent:
     """
     :param env_id: env
-    :param folder: log folder of ``sb3-htr train``, with the runs in ``<method>/<env_id>_<exp_id>``
+    :param folder: log folder of ``sb3-htr train``, with the runs in ``<method>/<stem>_<exp_id>``, see :func:`file_stem`
     :param method: name of a method; any by default, in the order of :func:`methods`
     :param exp_id: number of the run, 0 for the latest
     :param which: ``"best"`` or ``"last"`` model of a run
@@ -200,16 +213,17 @@ def agent_for(
     """
     names = list(methods()) if method is None else [get_method(method).name]
     numbers: list[str] = []
+    stem = file_stem(env_id)
     for name in names:
-        runs = [path.parent for path in Path(folder, name).glob(f"{env_id}_*/{RECORD}") if _number(path.parent, env_id) > 0]
-        runs = sorted(runs, key=lambda run: _number(run, env_id), reverse=True)
-        numbers += [f"{_number(run, env_id)} ({name})" for run in reversed(runs)]
-        for run in [run for run in runs if exp_id in (0, _number(run, env_id))]:
+        runs = [path.parent for path in Path(folder, name).glob(f"{stem}_*/{RECORD}") if _number(path.parent, stem) > 0]
+        runs = sorted(runs, key=lambda run: _number(run, stem), reverse=True)
+        numbers += [f"{_number(run, stem)} ({name})" for run in reversed(runs)]
+        for run in [run for run in runs if exp_id in (0, _number(run, stem))]:
             # A run that has no model yet is passed over, if it was not asked for
-            if exp_id or (run / "best_model.zip").exists() or (run / f"{env_id}.zip").exists():
+            if exp_id or (run / "best_model.zip").exists() or (run / f"{stem}.zip").exists():
                 return agent_at(run, which)
     for name in names if not exp_id else ():
-        file = shipped("trained_agents") / name / f"{env_id}.zip"
+        file = shipped("trained_agents") / name / f"{stem}.zip"
         if file.exists():
             return agent_at(file)
     wanted = f"{env_id}" + (f" run {exp_id}" if exp_id else "") + (f" by {method}" if method else "")
@@ -222,7 +236,7 @@ def agent_for(
     )
 
 
-def _number(run: Path, env_id: str) -> int:
-    """Of a run folder, rl_zoo3's ``<env_id>_<number>``, or with a unique id behind it; 0 for another folder."""
-    number = run.name.removeprefix(f"{env_id}_").split("_")[0]
+def _number(run: Path, stem: str) -> int:
+    """Of a run folder, rl_zoo3's ``<stem>_<number>``, or with a unique id behind it; 0 for another folder."""
+    number = run.name.removeprefix(f"{stem}_").split("_")[0]
     return int(number) if number.isdigit() else 0

@@ -7,6 +7,7 @@ import yaml
 from huggingface_hub import EvalResult, ModelCardData
 
 from sb3_htr.adaptation.evaluation import AdaptationRecord
+from sb3_htr.zoo.run.agents import file_stem
 
 TAGS = (
     "deep-reinforcement-learning",
@@ -86,7 +87,10 @@ def model_card(record: dict[str, Any], scores: dict[str, AdaptationRecord], repo
     data = ModelCardData(library_name="stable-baselines3", tags=[env_id, *TAGS], model_name=name, eval_results=[result])
     kwargs = "".join(f", {key}={value!r}" for key, value in record["env_kwargs"].items())
     imports = "".join(f"import {package}  # registers the env\n" for package in record["gym_packages"] or ["htr_envs"])
-    path = f'"{env_id}.zip"'
+    if env_id.startswith("HiddenGoal/") and not record["gym_packages"]:
+        imports += f'htr_envs.hide_goal("{env_id.partition("/")[2]}")  # registers the family\n'
+    file = f"{file_stem(env_id)}.zip"
+    path = f'"{file}"'
     if repo_id is not None:
         imports += "from huggingface_hub import hf_hub_download\n"
         path = f'hf_hub_download("{repo_id}", {path})'
@@ -113,7 +117,7 @@ paper.
 
 ```console
 $ pip install 'sb3_htr[zoo,video]'
-$ sb3-htr enjoy {env_id}.zip
+$ sb3-htr enjoy {file}
 ```
 
 ```python

@@ -1,0 +1,244 @@
+"""GoalEnvs of other packages: how one is found, made and asked for goals and rewards."""
+
+from __future__ import annotations
+
+import copy
+import importlib
+from dataclasses import dataclass, field
+from functools import lru_cache
+from importlib.metadata import version
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.error import DependencyNotInstalled, UnregisteredEnv
+from numpy.typing import ArrayLike
+
+from htr_envs.task_env import FloatArray
+
+# Packages whose ids are known without their names, and the extras that install them
+SUITES = {"gymnasium_robotics": "robotics", "panda_gym": "panda"}
+GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
+# How far from one goal to the next rewards are looked at, to tell a sparse reward from one that grows on the way
+WAY = (0.001, 0.01, 0.1, 0.5, 1.0)
+N_STEPS = 20  # whose rewards are compared with compute_reward
+MAX_DRAWS = 100  # for each task, where an env draws the same goals again and again
+
+
+@dataclass(frozen=True)
+class GoalEnvSource:
+    """Where GoalEnvs come from, as small as a task family needs it to be pickled. Equal sources make equal envs."""
+
+    name: str
+    """The id with its arguments."""
+    spec: EnvSpec = field(repr=False, compare=False)
+    """The registration, of a copy that has the arguments; what is pickled needs no registry where it is unpickled."""
+
+    @classmethod
+    def find(cls, env_id: str | EnvSpec, env_kwargs: dict[str, Any]) -> GoalEnvSource:
+        """Look a GoalEnv up.
+
+        :param env_id: a registered id, ``"module:id"`` of one that the module registers, or a registration.
+        :param env_kwargs: its arguments, beside those of the registration.
+        :return: the source.
+        :raises gymnasium.error.Error: if there is no such env, or its package is not installed.
+        """
+        spec = copy.deepcopy(_find_spec(env_id) if isinstance(env_id, str) else env_id)
+        spec.kwargs.update(env_kwargs)
+        return cls(f"{spec.id}({', '.join(f'{key}={value!r}' for key, value in sorted(spec.kwargs.items()))})", spec)
+
+    def dense(self) -> GoalEnvSource | None:
+        """The same env with its dense reward, None where it has no argument ``reward_type``."""
+        return self.find(self.spec, {"reward_type": "dense"}) if "reward_type" in self.spec.kwargs else None
+
+    def make(self, **kwargs: Any) -> gym.Env[Any, Any]:
+        """Make an env without a time limit.
+
+        :param kwargs: further arguments, such as ``render_mode``.
+        :return: the env.
+        :raises gymnasium.error.DependencyNotInstalled: if it does not work with the installed version of MuJoCo.
+        """
+        try:
+            return gym.make(self.spec, max_episode_steps=-1, disable_env_checker=True, **kwargs)
+        except AssertionError as error:
+            # Fetch, Hand and Kitchen compare MuJoCo's joint types with numbers, which is never true from 3.12 on
+            if str(self.spec.entry_point).startswith("gymnasium_robotics") and _mujoco_version() >= (3, 12):
+                raise DependencyNotInstalled(
+                    f"{self.spec.id} does not work with MuJoCo {version('mujoco')}, it needs a version below 3.12: "
+                    'run `pip install "sb3_htr[robotics]"`.'
+                ) from error
+            raise
+
+
+def _find_spec(env_id: str) -> EnvSpec:
+    module, _, env_id = env_id.rpartition(":")
+    missing = []
+    for name in [module] if module else SUITES if env_id not in gym.registry else []:
+        try:
+            importlib.import_module(name)
+        except ModuleNotFoundError as error:
+            if error.name != name:
+                raise
+            missing.append(name)
+    try:
+        return gym.spec(env_id)
+    except UnregisteredEnv as error:
+        if not missing:
+            raise
+        packages = [f'"sb3_htr[{SUITES[name]}]"' if name in SUITES else name for name in missing]
+        other = "" if module else f", or name the module that registers the env, as in 'module:{env_id}'"
+        raise DependencyNotInstalled(
+            f"There is no env {env_id}, and {' and '.join(missing)} cannot be imported: "
+            f"run `pip install {' '.join(packages)}`{other}."
+        ) from error
+
+
+def _mujoco_version() -> tuple[int, ...]:
+    return tuple(int(number) for number in version("mujoco").split(".")[:2])
+
+
+@lru_cache(maxsize=16)
+def probe(source: GoalEnvSource) -> gym.Env[Any, Any]:
+    """An env to ask for spaces, goals and rewards, one for all task families of this process.
+
+    :param source: where it comes from.
+    :return: the env; what it is in the middle of means nothing.
+    :raises ValueError: if it is no GoalEnv.
+    """
+    env = source.make()
+    space, action_space = env.observation_space, env.action_space
+    boxes = [space.spaces.get(key) for key in GOAL_KEYS] if isinstance(space, spaces.Dict) else [None]
+    if not all(map(_is_flat, boxes)) or not env.has_wrapper_attr("compute_reward"):
+        raise ValueError(
+            f"{source.spec.id} is no GoalEnv: its observations must be a Dict of one-dimensional boxes observation, "
+            "achieved_goal and desired_goal, and it must have compute_reward(achieved_goal, desired_goal, info)."
+        )
+    if not _is_flat(action_space):
+        raise ValueError(f"The action space of {source.spec.id} is {action_space}, expected a one-dimensional Box.")
+    return env
+
+
+def _is_flat(space: spaces.Space[Any] | None) -> bool:
+    return isinstance(space, spaces.Box) and len(space.shape) == 1
+
+
+def goal_rewards(source: GoalEnvSource, achieved_goals: ArrayLike, goals: ArrayLike) -> FloatArray:
+    """The env's own rewards.
+
+    :param source: of the env.
+    :param achieved_goals: shape (..., goal_dim).
+    :param goals: shape (..., goal_dim); leading axes broadcast.
+    :return: rewards, shape (...), float32.
+    :raises ValueError: if the env's ``compute_reward`` does not take many goals at once.
+    """
+    env = probe(source)
+    assert isinstance(env.observation_space, spaces.Dict)
+    # float32 as in observations; then rows in one piece, whatever the leading axes: sums may be ordered by memory layout, and
+    # rewards must be the same bits
+    both = np.broadcast_arrays(*(np.asarray(values, dtype=np.float32) for values in (achieved_goals, goals)))
+    achieved, desired = (
+        np.ascontiguousarray(values.reshape(-1, values.shape[-1]), dtype=env.observation_space[key].dtype)
+        for values, key in zip(both, GOAL_KEYS[1:], strict=True)
+    )
+    try:
+        # as Stable-Baselines3's HER calls it, but for what infos hold
+        rewards = np.asarray(env.get_wrapper_attr("compute_reward")(achieved, desired, np.full(len(achieved), {})))
+    except Exception as error:
+        raise ValueError(_not_vectorized(source, f"raised {error!r}")) from error
+    if rewards.shape != achieved.shape[:1]:
+        raise ValueError(_not_vectorized(source, f"returned an array {rewards.shape}"))
+    return rewards.astype(np.float32).reshape(both[0].shape[:-1])
+
+
+def _not_vectorized(source: GoalEnvSource, what: str) -> str:
+    return (
+        f"compute_reward of {source.spec.id} {what} for goals of shape (n, goal_dim) and an array of n empty infos, expected "
+        "n rewards: let it take many goals at once, as HER does, and nothing from infos."
+    )
+
+
+class GoalSets(NamedTuple):
+    """Goals of a family, all of them different, shapes (n, goal_dim), and the reward where none is reached."""
+
+    train: FloatArray
+    validation: FloatArray
+    test: FloatArray
+    failure_reward: float
+
+
+@lru_cache(maxsize=16)
+def draw_goal_sets(source: GoalEnvSource, n_train: int, n_validation: int, n_test: int, task_seed: int) -> GoalSets:
+    """Have an env draw the goals of a family, and check its rewards with them.
+
+    :param source: of the env.
+    :param n_train: how many training goals.
+    :param n_validation: how many validation goals.
+    :param n_test: how many test goals.
+    :param task_seed: seed of all three; each has a source of randomness of its own.
+    :return: the goals; must not be written to.
+    :raises ValueError: if the env has too few goals, or its reward is not sparse.
+    """
+    if min(n_train, n_validation, n_test) < 1:
+        raise ValueError(
+            f"n_train_tasks, n_validation_tasks, n_test_tasks are {n_train}, {n_validation}, {n_test}: each must be at least "
+            "1."
+        )
+    seen: dict[bytes, FloatArray] = {}
+    for purpose, n in enumerate((n_train, n_validation, n_test)):
+        # numpy never changes RandomState's stream, as it may Generator's
+        random_state = np.random.RandomState([task_seed, purpose])
+        wanted = len(seen) + n
+        for _ in range(MAX_DRAWS * n):
+            goal = draw_goal(source, int(random_state.randint(2**31 - 1)))
+            seen.setdefault((goal + np.float32(0.0)).tobytes(), goal)
+            if len(seen) == wanted:
+                break
+        else:
+            raise ValueError(
+                f"{source.spec.id} drew only {len(seen)} different goals, but training, validation and test tasks must "
+                "differ: ask for fewer by n_train_tasks, n_validation_tasks and n_test_tasks."
+            )
+    goals = np.stack(list(seen.values()))
+    train, validation, test = np.split(goals, [n_train, n_train + n_validation])
+    return GoalSets(train, validation, test, _failure_reward(source, goals))
+
+
+def draw_goal(source: GoalEnvSource, seed: int) -> FloatArray:
+    """Have an env draw a goal.
+
+    :param source: of the env.
+    :param seed: of the draw.
+    :return: the goal, shape (goal_dim,).
+    """
+    observation, _ = probe(source).reset(seed=seed)
+    return np.array(observation["desired_goal"], dtype=np.float32)
+
+
+def _failure_reward(source: GoalEnvSource, goals: FloatArray) -> float:
+    others = np.roll(goals, 1, axis=0)
+    found = np.unique(np.stack([goal_rewards(source, goals + np.float32(t) * (others - goals), goals) for t in WAY]))
+    success = np.unique(goal_rewards(source, goals, goals))
+    if len(success) != 1 or not np.array_equal(np.union1d(found, success), success[0] - np.array([1.0, 0.0])):
+        shown = ", ".join(f"{value:.3g}" for value in np.union1d(found, success)[:5])
+        raise ValueError(
+            f"compute_reward of {source.spec.id} gives {shown} ..., but a sparse reward is -1 and 0, or 0 and 1, the larger "
+            "one at the goal: choose it by an argument of the env, such as reward_type='sparse'."
+        )
+    _check_steps(source)
+    return float(success[0]) - 1.0
+
+
+def _check_steps(source: GoalEnvSource) -> None:
+    env = probe(source)
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    for _ in range(N_STEPS):
+        observation, reward, *_ = env.step(env.action_space.sample())
+        expected = float(goal_rewards(source, observation["achieved_goal"], observation["desired_goal"]))
+        if float(reward) != expected:
+            raise ValueError(
+                f"A step of {source.spec.id} gave the reward {float(reward):.3g}, but compute_reward gives {expected:.3g} "
+                "without infos: a reward must depend on achieved and desired goal alone."
+            )
