@@ -5,11 +5,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 
-from sb3_htr.adaptation.context import evenly_spread
 from sb3_htr.adaptation.explorers import Explorer
 from sb3_htr.adaptation.knowledge import LatentKnowledge
 from sb3_htr.adaptation.policy import ContextualPolicy
 from sb3_htr.common.type_aliases import Context
+from sb3_htr.htr.episode_store import evenly_spread
 
 # A return without its task-free part is that much above 0, or it is 0: the difference of two sums of float32
 ROUNDING = 1e-5

@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 
-from sb3_htr.adaptation.context import evenly_spread
 from sb3_htr.common.random_state import get_generator_state, set_generator_state
 from sb3_htr.common.type_aliases import TaskFamily
+from sb3_htr.htr.episode_store import evenly_spread
 from sb3_htr.htr.transitions import Transitions
 
 # Training tasks that are in the bank; of more, evenly spread ones. The cost of an episode is flat from there on

@@ -1,4 +1,19 @@
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
-from sb3_htr.htr.relabel import EpisodeClustering, HindsightTaskStrategy, Relabeller, SingleEpisodeRelabelling
+from sb3_htr.htr.relabel import (
+    EpisodeClustering,
+    HindsightForesight,
+    HindsightInference,
+    HindsightTaskStrategy,
+    Relabeller,
+    SingleEpisodeRelabelling,
+)
 
-__all__ = ["EpisodeClustering", "HindsightTaskStrategy", "MultiTaskReplayBuffer", "Relabeller", "SingleEpisodeRelabelling"]
+__all__ = [
+    "EpisodeClustering",
+    "HindsightForesight",
+    "HindsightInference",
+    "HindsightTaskStrategy",
+    "MultiTaskReplayBuffer",
+    "Relabeller",
+    "SingleEpisodeRelabelling",
+]

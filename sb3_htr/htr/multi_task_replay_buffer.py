@@ -153,6 +153,18 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         """
         return len(self.episodes.index().rows)
 
+    def rewarded_fraction(self, episodes: EpisodeStore) -> float:
+        """
+        :param episodes: the buffer's own, or those of a relabeller
+        :return: share of them with a reward beside the task-free one, 0 if there are none
+        """
+        index, columns = episodes.index(), self.transitions
+        if len(index.rows) == 0:
+            return 0.0
+        rows = episodes.rows[index.rows]
+        task_part = np.abs(rows[:, columns.reward] - rows[:, columns.task_free_reward]) > 0
+        return float((np.add.reduceat(task_part, index.episode_row[:-1]) > 0).mean())
+
     def stats(self) -> dict[str, float]:
         """
         :return: what is worth logging, by its key
@@ -312,7 +324,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
                 anywhere = len(context) + np.flatnonzero(is_hindsight[len(context) :])
                 anywhere = anywhere[self.relabel_rng.random(len(anywhere)) < hindsight.elsewhere]
                 virtual[anywhere] = self.relabel_rng.integers(len(index.rows), size=len(anywhere))
-            rows = self._take(virtual, is_hindsight, hindsight.store)
+            rows = self.take(virtual, is_hindsight, hindsight.store)
             if not hindsight.is_relabelled:
                 where = np.flatnonzero(is_hindsight)
                 self.write_rewards(rows, where, reward_task[task_of_row[where]])
@@ -359,8 +371,13 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         dtypes = (np.int64, *[np.float32] * 4)
         return RewardLabels(*(self.to_torch(x.astype(dtype)) for x, dtype in zip(labels, dtypes, strict=True)))
 
-    def _take(self, virtual: np.ndarray, is_hindsight: np.ndarray, store: EpisodeStore) -> np.ndarray:
-        """(n, width), copies of virtual rows, some of which are of another store than the buffer's own."""
+    def take(self, virtual: np.ndarray, is_hindsight: np.ndarray, store: EpisodeStore) -> np.ndarray:
+        """
+        :param virtual: (n,) int, virtual rows
+        :param is_hindsight: (n,) bool, which of them are of another store than the buffer's own
+        :param store: the other store
+        :return: (n, width) float32, copies of these transitions
+        """
         if store is self.episodes:
             return self.episodes.take(virtual)
         rows = np.empty((len(virtual), self.transitions.width), dtype=np.float32)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sb3_htr.htr.episode_store import EpisodeStore
+from sb3_htr.htr.episode_store import EpisodeStore, evenly_spread
 
 
 @given(st.lists(st.tuples(st.integers(0, 2), st.integers(1, 4)), max_size=40), st.integers(0, 3))
@@ -45,3 +45,14 @@ def test_episodes_of_another_shape_are_refused() -> None:
     for shape in ((2, 4, 1), (3, 5, 1), (3, 4, 2)):
         with pytest.raises(ValueError, match="use the settings that they were saved with"):
             EpisodeStore(1, *shape).load_state_dict(state)
+
+
+@given(st.lists(st.integers(1, 300), min_size=1, max_size=6), st.integers(1, 40))
+def test_contexts_are_spread_over_their_episodes(lengths: list[int], size: int) -> None:
+    steps, taken = evenly_spread(np.array(lengths), size)
+    assert taken.tolist() == [min(length, size) for length in lengths]
+    for episode, length in zip(np.split(steps, np.cumsum(taken)[:-1]), lengths, strict=True):
+        # As far from each other as from the ends, up to rounding
+        gaps = np.diff(np.concatenate([[-1 - episode[0]], episode, [2 * length - 1 - episode[-1]]]))
+        assert episode.min() >= 0 and episode.max() < length and np.ptp(gaps) <= 2
+        assert length > size or (episode == np.arange(length)).all()

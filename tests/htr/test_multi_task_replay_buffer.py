@@ -194,7 +194,7 @@ def test_relabellers_given_to_two_models_are_not_shared(tiny_pearl: MakePEARL, r
         ({"context_episodes": 0}, "context_episodes is 0"),
         ({"buffer_size": 100}, "too small for one episode"),
         ({"optimize_memory_usage": True}, "optimize_memory_usage is not supported"),
-        ({"relabeller": "Nobody"}, r"relabeller is 'Nobody', expected one of \['EpisodeClustering', 'SingleEpisode"),
+        ({"relabeller": "Nobody"}, r"relabeller is 'Nobody', expected one of \['EpisodeClustering', 'Hindsight"),
         ({"relabeller": {"cell_size": 0.1}}, "relabeller is {'cell_size': 0.1}, expected one of"),
         ({"relabeller": None}, "relabeller is None, expected one of"),
     ],

@@ -1,16 +1,33 @@
 """How experience gets another task."""
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
+import torch as th
 
+from sb3_htr.common.type_aliases import Context
 from sb3_htr.htr.episode_store import EpisodeStore
 
 if TYPE_CHECKING:
-    from stable_baselines3.common.policies import BasePolicy
-
     from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
+
+
+class AdaptingPolicy(Protocol):
+    """What a relabeller may ask of networks; :class:`sb3_htr.pearl.policies.PEARLPolicy` is one."""
+
+    @property
+    def device(self) -> th.device:
+        """Where the networks are."""
+        ...
+
+    def infer(self, context: Context) -> tuple[th.Tensor, th.Tensor]:
+        """Mean and variance (n_tasks, latent_dim) of the posteriors over z."""
+        ...
+
+    def values(self, obs: np.ndarray, z: th.Tensor, actions: np.ndarray | None = None) -> th.Tensor:
+        """Values (n, k) of acting with z (n, k, latent_dim) in observations (n, obs_dim), after ``actions`` if given."""
+        ...
 
 
 class HindsightDraw(NamedTuple):
@@ -46,7 +63,7 @@ class Relabeller(ABC):
 
     buffer: "MultiTaskReplayBuffer"
     #: Networks, for strategies that ask for values of tasks
-    policy: "BasePolicy"
+    policy: AdaptingPolicy
 
     def bind(self, buffer: "MultiTaskReplayBuffer") -> None:
         """

@@ -105,15 +105,7 @@ class EpisodeClustering(Relabeller):
         """
         :return: share of the stored episodes with a reward beside the task-free one, in the real and in the hindsight buffers
         """
-        return self._rewarded(self.buffer.episodes), self._rewarded(self.episodes)
-
-    def _rewarded(self, episodes: EpisodeStore) -> float:
-        index, columns = episodes.index(), self.buffer.transitions
-        if len(index.rows) == 0:
-            return 0.0
-        rows = episodes.rows[index.rows]
-        task_part = np.abs(rows[:, columns.reward] - rows[:, columns.task_free_reward]) > 0
-        return float((np.add.reduceat(task_part, index.episode_row[:-1]) > 0).mean())
+        return self.buffer.rewarded_fraction(self.buffer.episodes), self.buffer.rewarded_fraction(self.episodes)
 
     def stats(self) -> dict[str, float]:
         real, hindsight = self.rewarded_fraction()

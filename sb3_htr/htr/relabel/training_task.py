@@ -1,0 +1,139 @@
+"""Relabelling under training tasks: what HFR and HIPI share."""
+
+from abc import abstractmethod
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch as th
+
+from sb3_htr.common.checks import check_numbers
+from sb3_htr.htr.episode_store import EpisodeStore
+from sb3_htr.htr.relabel.base import HindsightDraw, Relabeller
+
+if TYPE_CHECKING:
+    from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
+
+
+class TrainingTaskRelabelling(Relabeller):
+    """
+    Experience goes to the hindsight buffers of training tasks. A unit of it, an episode or a transition, goes to the task psi
+    with probability
+
+        q(psi | unit) proportional to exp(U(unit, psi) / temperature - log Z(psi)),
+
+    where U is the utility that a subclass defines, and Z(psi) the mean of exp(U / temperature) over the units that have come
+    in together. Without Z, an easy task would get everything.
+
+    Relabelling is eager, as in HFR's code: once, when the first meta-batch after a rollout is drawn, with the networks as they
+    are then. A relabelled row of a meta-batch is drawn as PEARL draws it, from the hindsight buffer of its task; a task whose
+    hindsight buffer is empty lends its row to one that has something. Hindsight buffers take as much memory as the replay.
+
+    :param temperature: what utilities are divided by. Both papers scale rewards instead, at entropy coefficient 1: this is the
+        entropy coefficient that goes with unscaled rewards. 0.01, the default, is the reward scale 100 of PEARL's and HFR's
+        point robots, and the default of :class:`sb3_htr.PEARL`; HFR's robots have 0.2. Infinity draws tasks evenly
+    :raises ValueError: if the temperature is not above 0
+    """
+
+    def __init__(self, temperature: float = 0.01) -> None:
+        check_numbers(temperature=(temperature, 0.0, float("inf")))
+        if temperature == 0:
+            raise ValueError("temperature is 0, by which utilities cannot be divided: expected a number above 0.")
+        self.temperature = temperature
+
+    @abstractmethod
+    def utilities(self, rows: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+        """
+        :param rows: (n, width) float32, transitions of some episodes, those of the first one first
+        :param lengths: (n_episodes,) int, how many are of each
+        :return: (n_units, n_tasks), utility of each unit for each training task. As many units as episodes or as transitions
+        """
+
+    def bind(self, buffer: "MultiTaskReplayBuffer") -> None:
+        super().bind(buffer)
+        self.reset()
+
+    def reset(self) -> None:
+        own = self.buffer.episodes
+        width = self.buffer.transitions.width
+        self.episodes = EpisodeStore(self.buffer.n_tasks, own.episodes_per_task, own.episode_length, width)
+        self._new: list[np.ndarray] = []
+        # Of the units that came in last: mean entropy of q in nats
+        self._entropy = 0.0
+
+    def on_episode(self, task: int, episode: np.ndarray) -> None:
+        self._new.append(episode.copy())
+
+    def draw(self, tasks: np.ndarray) -> HindsightDraw:
+        self._take_in()
+        buffer, index = self.buffer, self.episodes.index()
+        is_empty = np.diff(index.task_episode)[tasks] == 0
+        borrowed = index.tasks[buffer.relabel_rng.integers(len(index.tasks), size=len(tasks))]
+        chosen = np.where(is_empty, borrowed, tasks)
+        context = index.latest_episodes(chosen, buffer.context_episodes)
+        hindsight_tasks = buffer.task_family.train_tasks[chosen]
+        return HindsightDraw(self.episodes, context, index.all_episodes(chosen), hindsight_tasks, is_relabelled=True)
+
+    def _take_in(self) -> None:
+        """Relabel and store what has come in."""
+        if not self._new:
+            return
+        rows, lengths = np.concatenate(self._new), np.array([len(episode) for episode in self._new])
+        self._new = []
+        with th.no_grad():
+            logits = self.utilities(rows, lengths) / self.temperature
+        tasks = self._choose(logits)
+        if len(tasks) == len(lengths):
+            tasks, groups = np.repeat(tasks, lengths), tasks
+        else:
+            # Transitions of one task make up episodes of it, in the order in which they came
+            order = np.argsort(tasks, kind="stable")
+            rows, tasks = rows[order], tasks[order]
+            groups, lengths = _cut(np.bincount(tasks, minlength=self.buffer.n_tasks), self.episodes.episode_length)
+        self.buffer.write_rewards(rows, np.arange(len(rows)), self.buffer.task_family.train_tasks[tasks])
+        for task, episode in zip(groups, np.split(rows, np.cumsum(lengths)[:-1]), strict=True):
+            self.episodes.add(int(task), episode)
+
+    def _choose(self, logits: np.ndarray) -> np.ndarray:
+        """(n_units,) int, a task for each unit."""
+        logits = logits - _log_mean_exp(logits, axis=0)
+        log_q = logits - _log_mean_exp(logits, axis=1) - np.log(logits.shape[1])
+        self._entropy = float(-(np.exp(log_q) * log_q).sum(axis=1).mean())
+        # The largest of logits with Gumbel noise is a draw from their softmax
+        chosen: np.ndarray = (logits + self.buffer.relabel_rng.gumbel(size=logits.shape)).argmax(axis=1)
+        return chosen
+
+    def stats(self) -> dict[str, float]:
+        return {
+            "replay/relabelling_entropy": self._entropy,
+            "replay/n_hindsight_buffers": len(self.episodes.index().tasks),
+            "replay/rewarded_fraction_real": self.buffer.rewarded_fraction(self.buffer.episodes),
+            "replay/rewarded_fraction_hindsight": self.buffer.rewarded_fraction(self.episodes),
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        new = np.concatenate([np.zeros((0, self.buffer.transitions.width), dtype=np.float32), *self._new])
+        return {
+            "episodes": self.episodes.state_dict(),
+            "new": th.from_numpy(new),
+            "lengths": th.tensor([len(episode) for episode in self._new], dtype=th.int64),
+            "entropy": self._entropy,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.episodes.load_state_dict(state["episodes"])
+        self._new = [episode.numpy().copy() for episode in state["new"].split(state["lengths"].tolist())]
+        self._entropy = state["entropy"]
+
+
+def _log_mean_exp(x: np.ndarray, axis: int) -> np.ndarray:
+    """Of x along an axis, which is kept."""
+    largest = x.max(axis=axis, keepdims=True)
+    return np.asarray(largest + np.log(np.exp(x - largest).mean(axis=axis, keepdims=True)))
+
+
+def _cut(count: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of transitions of each task to parts of at most so many: the task of each part and its length, (n,) int each."""
+    n_parts = -(-count // size)
+    task = np.repeat(np.arange(len(count)), n_parts)
+    part = np.arange(len(task)) - np.repeat(np.cumsum(n_parts) - n_parts, n_parts)
+    return task, np.minimum(count[task] - part * size, size)
