@@ -95,6 +95,18 @@ class Adaptation:
         self.explorer.look(obs)
         return self.policy.act(obs, self.z, deterministic)
 
+    def exploring(self) -> np.ndarray:
+        """
+        :return: (n_envs,) bool, see :meth:`Explorer.exploring`
+        """
+        return self.explorer.exploring()
+
+    def deviation(self) -> np.ndarray:
+        """
+        :return: (n_envs,), standard deviation of what is known about z, mean over its dimensions
+        """
+        return np.asarray(self.explorer.deviation().mean(axis=1))
+
     def observe(self, step: Step) -> None:
         """
         :param step: what each env did

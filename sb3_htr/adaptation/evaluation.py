@@ -15,12 +15,26 @@ from sb3_htr.common.checks import check_is_not_normalized, get_task_family
 from sb3_htr.common.vec_env import make_task_vec_env
 
 
+class Named(Protocol):
+    """Something with a name, as explorers have."""
+
+    @property
+    def name(self) -> str:
+        """In tables and pictures."""
+        ...
+
+
 class MetaLearner(Protocol):
     """What :func:`evaluate_adaptation` asks of a model; :class:`sb3_htr.PEARL` is one."""
 
     @property
     def policy(self) -> Any:
         """Networks, an SB3 policy."""
+        ...
+
+    @property
+    def explorer(self) -> Named:
+        """How it explores unless told otherwise."""
         ...
 
     def start_adaptation(self, n_envs: int, explorer: Any = None, generator: th.Generator | None = None) -> Adapts:
@@ -139,7 +153,7 @@ def evaluate_adaptation(
 
     The context of a task's posterior comes from the episodes of this very adaptation and from nowhere else.
 
-    :param model: a PEARL
+    :param model: a PEARL, or a rival
     :param env: env, VecEnv (its envs adapt side by side, each to a task of its own) or registered id
     :param tasks: (n_tasks, task_dim), by default the test tasks of the env
     :param n_episodes: adaptation episodes per task; 20 in PEARL's reference

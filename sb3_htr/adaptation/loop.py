@@ -1,7 +1,7 @@
 """The step loop that rollouts, evaluations and whoever watches an agent share."""
 
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
@@ -18,6 +18,23 @@ class Adapts(Protocol):
 
     def observe(self, step: Step) -> None:
         """Take in one step of each env."""
+        ...
+
+    def exploring(self) -> np.ndarray:
+        """(n_envs,) bool, whether nothing is known about the task yet but what was tried in vain."""
+        ...
+
+    def deviation(self) -> np.ndarray:
+        """(n_envs,), how uncertain the task is, in units of the agent's own; NaN for an agent that cannot say."""
+        ...
+
+
+@runtime_checkable
+class SeesTasks(Protocol):
+    """An adaptation that is told the tasks: of an agent that is no rival but a ceiling."""
+
+    def see_tasks(self, tasks: np.ndarray) -> None:
+        """Tasks (n_envs, task_dim) of the envs, before the first step."""
         ...
 
 
@@ -42,6 +59,8 @@ def adaptation_steps(
     """
     if obs is None:
         obs = env.reset()
+    if isinstance(adaptation, SeesTasks):
+        adaptation.see_tasks(np.stack(env.get_attr("task")))
     remaining = np.full(env.num_envs, n_episodes)
     while (remaining > 0).any():
         actions = act(obs)

@@ -49,6 +49,24 @@ def check_numbers(**numbers: tuple[Any, float, float]) -> None:
             raise ValueError(f"{name} is {value!r}, expected {article} {limits}.")
 
 
+def keywords_of(function: Callable[..., Any]) -> set[str]:
+    """
+    :param function: or a class
+    :return: names of the arguments that it takes
+    """
+    known: set[str] = set()
+    for part in getattr(function, "__mro__", (function,)):
+        own = vars(part).get("__init__") if isinstance(part, type) else part
+        if own is None:
+            continue
+        # A class that hands its keywords on has those of its parent too
+        parameters = inspect.signature(own).parameters
+        known |= {name for name, parameter in parameters.items() if parameter.kind not in VARIADIC}
+        if not any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in parameters.values()):
+            break
+    return known - {"self"}
+
+
 def check_keywords(owner: str, given: Iterable[str], function: Callable[..., Any], also: Iterable[str] = ()) -> None:
     """
     :param owner: whose keywords they are, for the message
@@ -57,14 +75,7 @@ def check_keywords(owner: str, given: Iterable[str], function: Callable[..., Any
     :param also: names that are known elsewhere
     :raises ValueError: for the first name that is not known, with the one most like it
     """
-    known: set[str] = set(also)
-    for part in getattr(function, "__mro__", (function,)):
-        # A class that hands its keywords on has those of its parent too
-        parameters = inspect.signature(vars(part).get("__init__", part) if isinstance(part, type) else part).parameters
-        known |= {name for name, parameter in parameters.items() if parameter.kind not in VARIADIC}
-        if not any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in parameters.values()):
-            break
-    known -= {"self"}
+    known = keywords_of(function) | set(also)
     for name in given:
         if name not in known:
             nearest = difflib.get_close_matches(name, known, n=1)

@@ -5,7 +5,7 @@ import subprocess
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-PACKAGES = ("sb3_htr", "stable_baselines3", "gymnasium", "rl_zoo3", "torch", "numpy", "mujoco")
+PACKAGES = ("sb3_htr", "stable_baselines3", "sb3_contrib", "gymnasium", "rl_zoo3", "torch", "numpy", "mujoco")
 
 
 def versions() -> dict[str, str]:

@@ -5,8 +5,7 @@ import pathlib
 import pickle
 import warnings
 import zipfile
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import IO, Any, TypeVar, cast
 
@@ -31,7 +30,9 @@ from sb3_htr.adaptation.task_bank import TaskBank
 from sb3_htr.common import checks
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.progress import MetaProgressBarCallback
-from sb3_htr.common.random_state import get_generator_state, get_global_state, set_generator_state, set_global_state
+from sb3_htr.common.random_state import get_generator_state, set_generator_state
+from sb3_htr.common.saving import AtomicSave, with_suffix
+from sb3_htr.common.training_state import get_training_state, set_random_state, set_training_state
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.pearl.policies import PEARLPolicy
@@ -41,7 +42,7 @@ SelfMetaAlgorithm = TypeVar("SelfMetaAlgorithm", bound="OffPolicyMetaAlgorithm")
 COUNTERS = ("num_timesteps", "_episode_num", "_n_updates", "_n_rollouts", "_current_progress_remaining")
 
 
-class OffPolicyMetaAlgorithm(SAC):
+class OffPolicyMetaAlgorithm(AtomicSave, SAC):
     """
     SAC whose rollouts are adaptations to training tasks and whose replay is ordered by task. A subclass adds ``train``.
 
@@ -222,7 +223,9 @@ class OffPolicyMetaAlgorithm(SAC):
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         result = super()._setup_learn(*args, **kwargs)
         if self._pending_random is not None:
-            self._set_random_state(self._pending_random)
+            assert self.env is not None
+            set_random_state(self.env, self._pending_random)
+            set_generator_state(self._rng, self._pending_random["model"])
             self._pending_random = None
         return result
 
@@ -418,22 +421,6 @@ class OffPolicyMetaAlgorithm(SAC):
 
     # Files and state
 
-    def save(
-        self,
-        path: str | pathlib.Path | io.BufferedIOBase,
-        exclude: Iterable[str] | None = None,
-        include: Iterable[str] | None = None,
-    ) -> None:
-        """
-        :param path: file, ``.zip`` is added to a name without suffix; it is replaced at the end or not at all
-        :param exclude: attributes to leave out
-        :param include: attributes to save that would be left out
-        """
-        if isinstance(path, io.IOBase):
-            return super().save(path, exclude, include)
-        with atomic_path(_with_suffix(path, ".zip")) as temporary:
-            super().save(temporary, exclude, include)
-
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "knowledge", "task_bank", "_pending_random", "update_listeners"]
 
@@ -451,7 +438,7 @@ class OffPolicyMetaAlgorithm(SAC):
         state = {"replay": self.replay_buffer.state_dict(), "task_bank": self.task_bank.state_dict()}
         if isinstance(path, io.IOBase):
             return th.save(state, cast(IO[bytes], path))
-        with atomic_path(_with_suffix(path, ".pt")) as temporary:
+        with atomic_path(with_suffix(path, ".pt")) as temporary:
             th.save(state, temporary)
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
@@ -464,7 +451,7 @@ class OffPolicyMetaAlgorithm(SAC):
             raise ValueError(
                 "This model has no env, so it has no replay buffer to fill: pass env=... to load, or call set_env."
             )
-        file: Any = path if isinstance(path, io.IOBase) else _with_suffix(path, ".pt")
+        file: Any = path if isinstance(path, io.IOBase) else with_suffix(path, ".pt")
         try:
             # torch writes a zip file, and does not look at its checksums
             with zipfile.ZipFile(file) as archive:
@@ -491,21 +478,14 @@ class OffPolicyMetaAlgorithm(SAC):
 
         :return: tensors, numbers, strings, None, for :meth:`load_state_dict`
         """
-        assert self.replay_buffer is not None and self.task_bank is not None and self.env is not None
+        assert self.replay_buffer is not None and self.task_bank is not None
+        state = get_training_state(self, COUNTERS)
         return {
-            "parameters": self.get_parameters(),
-            "log_ent_coef": None if self.log_ent_coef is None else self.log_ent_coef.detach(),
-            "counters": {name: getattr(self, name) for name in COUNTERS},
+            **state,
             "task_queue": th.from_numpy(self._task_queue.copy()),
-            "episode_infos": [{k: _tensor(v) for k, v in info.items()} for info in self.ep_info_buffer or ()],
-            "episode_successes": [_tensor(success) for success in self.ep_success_buffer or ()],
             "replay": self.replay_buffer.state_dict(),
             "task_bank": self.task_bank.state_dict(),
-            "random": {
-                "global": get_global_state(),
-                "model": get_generator_state(self._rng),
-                "envs": [get_generator_state(generator) for generator in self.env.get_attr("np_random")],
-            },
+            "random": {**state["random"], "model": get_generator_state(self._rng)},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -515,38 +495,8 @@ class OffPolicyMetaAlgorithm(SAC):
         :param state: of :meth:`state_dict` of a model with the same settings
         """
         assert self.replay_buffer is not None and self.task_bank is not None
-        self.set_parameters(state["parameters"], exact_match=True, device=self.device)
-        if self.log_ent_coef is not None:
-            self.log_ent_coef.data.copy_(state["log_ent_coef"])
-        for name, value in state["counters"].items():
-            setattr(self, name, value)
+        set_training_state(self, state)
         self._task_queue = state["task_queue"].numpy().copy()
-        infos = [{key: _number(value) for key, value in info.items()} for info in state["episode_infos"]]
-        self.ep_info_buffer = deque(infos, maxlen=self._stats_window_size)
-        successes = [_number(success) for success in state["episode_successes"]]
-        self.ep_success_buffer = deque(successes, maxlen=self._stats_window_size)
         self.replay_buffer.load_state_dict(state["replay"])
         self.task_bank.load_state_dict(state["task_bank"])
         self._pending_random = state["random"]
-
-    def _set_random_state(self, state: dict[str, Any]) -> None:
-        assert self.env is not None
-        set_global_state(state["global"])
-        set_generator_state(self._rng, state["model"])
-        for i, (generator, saved) in enumerate(zip(self.env.get_attr("np_random"), state["envs"], strict=True)):
-            set_generator_state(generator, saved)
-            self.env.set_attr("np_random", generator, indices=i)
-
-
-def _with_suffix(path: str | pathlib.Path | io.BufferedIOBase, suffix: str) -> pathlib.Path:
-    path = pathlib.Path(cast(str, path))
-    return path if path.suffix else path.with_suffix(suffix)
-
-
-def _tensor(value: Any) -> th.Tensor:
-    """A number or array, with its dtype: means of float32 numbers are other ones than those of float64."""
-    return th.from_numpy(np.array(value))
-
-
-def _number(tensor: th.Tensor) -> Any:
-    return tensor.cpu().numpy()[()]

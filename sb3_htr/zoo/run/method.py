@@ -6,19 +6,58 @@ from typing import Any
 
 import yaml
 
+from sb3_htr.common.checks import keywords_of
+from sb3_htr.htr.relabel import RELABELLERS
+from sb3_htr.zoo.run.algorithm import ALGORITHMS, Algorithm
 from sb3_htr.zoo.run.shipped import hyperparams_file
 
 DEFAULT = "htr-ser"
 PRIOR = "-prior"
+# In place of an explorer's name, for agents that explore in a way of their own
+OWN = "own"
 
 
 @dataclass(frozen=True)
 class Method:
     """
-    Everything that two methods may differ in; all else is a setting of the env.
+    An algorithm, and everything that two methods may differ in; all else is a setting of the env.
 
     :param name: in commands, folders, tables and pictures
     :param label: for people
+    :param about: what it is, for model cards
+    :param algorithm: name of the algorithm
+    """
+
+    name: str
+    label: str
+    about: str
+    algorithm_name: str
+
+    @property
+    def algorithm(self) -> Algorithm:
+        """What trains it."""
+        return ALGORITHMS[self.algorithm_name]
+
+    def settings(self, of_env: dict[str, Any]) -> dict[str, Any]:
+        """
+        :param of_env: hyperparameters of the env
+        :return: the same, joined with those of the method
+        """
+        return of_env
+
+    def explorers(self, names: tuple[str, ...]) -> tuple[str, ...]:
+        """
+        :param names: of explorers that agents are to be evaluated with
+        :return: the same, or how an agent without explorers explores
+        """
+        return (OWN,)
+
+
+@dataclass(frozen=True)
+class PEARLMethod(Method):
+    """
+    PEARL, with or without relabelling.
+
     :param relabeller: name of a :class:`sb3_htr.htr.Relabeller`
     :param relabel_probability: K
     :param rl_reward_type: reward of the RL batch
@@ -26,8 +65,6 @@ class Method:
     :param explorer: the same at meta-test
     """
 
-    name: str
-    label: str
     relabeller: str
     relabel_probability: float
     rl_reward_type: str
@@ -48,7 +85,25 @@ class Method:
             },
         }
 
-    def under_prior(self) -> "Method":
+    def settings(self, of_env: dict[str, Any]) -> dict[str, Any]:
+        buffer = of_env.get("replay_buffer_kwargs", {})
+        if isinstance(buffer.get("relabeller"), dict):
+            # An env's settings for other relabellers say nothing about this one
+            of_others = set().union(*map(keywords_of, RELABELLERS.values())) - self.relabeller_settings()
+            relabeller = {key: value for key, value in buffer["relabeller"].items() if key not in of_others}
+            of_env = {**of_env, "replay_buffer_kwargs": {**buffer, "relabeller": relabeller}}
+        return merged(of_env, self.hyperparams())
+
+    def relabeller_settings(self) -> set[str]:
+        """
+        :return: names of the settings that its relabeller has
+        """
+        return keywords_of(RELABELLERS[self.relabeller])
+
+    def explorers(self, names: tuple[str, ...]) -> tuple[str, ...]:
+        return names
+
+    def under_prior(self) -> "PEARLMethod":
         """
         :return: the same method under PEARL's own protocol
         """
@@ -67,8 +122,14 @@ def methods() -> dict[str, Method]:
     :return: all methods by their names, in the order in which tables and pictures have them
     """
     content = yaml.safe_load(hyperparams_file("methods.yml").read_text())
-    own = [Method(name, **settings) for name, settings in content.items()]
-    return {method.name: method for method in (*own, *(method.under_prior() for method in own))}
+    own = [_method(name, **settings) for name, settings in content.items()]
+    under_prior = [method.under_prior() for method in own if isinstance(method, PEARLMethod)]
+    return {method.name: method for method in (*own, *under_prior)}
+
+
+def _method(name: str, label: str, about: str = "", algorithm: str = "pearl", **settings: Any) -> Method:
+    kind = PEARLMethod if algorithm == "pearl" else Method
+    return kind(name, label, " ".join(about.split()), algorithm, **settings)
 
 
 def get_method(name: str) -> Method:

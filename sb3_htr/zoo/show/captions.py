@@ -50,8 +50,9 @@ class Captioner:
 
         y += size * LINE
         bars = left + COLUMN * size
-        draw.text((left, y), f"uncertainty of z {moment.deviation:.2f}", INK, font)
-        self._bar(draw, (bars, y + 0.2 * size, right, y + 1.0 * size), moment.deviation / max(self._deviation, 1e-9))
+        if not np.isnan(moment.deviation):
+            draw.text((left, y), f"uncertainty of z {moment.deviation:.2f}", INK, font)
+            self._bar(draw, (bars, y + 0.2 * size, right, y + 1.0 * size), moment.deviation / max(self._deviation, 1e-9))
 
         y += size * (LINE + 0.3)
         draw.text((left, y + 0.3 * size), "return of each episode", INK, font)

@@ -10,7 +10,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_htr import PEARL
+from sb3_htr.adaptation.evaluation import MetaLearner
 from sb3_htr.adaptation.loop import adaptation_steps
 
 
@@ -26,7 +26,7 @@ class Moment:
     :param returns: of the episodes so far, the current one last
     :param successes: whether each of them solved the task so far
     :param exploring: whether the explorer chose z in this episode
-    :param deviation: standard deviation of what is known about z, mean over its dimensions
+    :param deviation: standard deviation of what is known about z, mean over its dimensions; NaN for an agent without z
     :param ended: whether the episode ends here
     :param frame: (height, width, 3) uint8, None where none was taken
     """
@@ -91,7 +91,7 @@ class Player:
     """
     Plays adaptations of a model in one env.
 
-    :param model: a PEARL
+    :param model: a PEARL, or a rival
     :param env: single env of its task family
     :param explorer: name of the explorer, the model's own by default
     :param deterministic: mean actions instead of samples
@@ -101,7 +101,7 @@ class Player:
 
     def __init__(
         self,
-        model: PEARL,
+        model: MetaLearner,
         env: gym.Env,
         explorer: str | None = None,
         deterministic: bool = True,
@@ -129,7 +129,7 @@ class Player:
         successes: list[bool] = []
 
         def moment(step: int, exploring: bool, ended: bool) -> Moment:
-            deviation = float(adaptation.explorer.deviation().mean())
+            deviation = float(adaptation.deviation()[0])
             scores = tuple(returns), tuple(successes)
             frame = self.camera.next_frame()
             return Moment(number, len(tasks), n_episodes, step, *scores, exploring, deviation, ended, frame)
@@ -141,7 +141,7 @@ class Player:
 
         env.set_options({"task": tasks[number - 1]})
         self.camera.frames.clear()
-        obs, n_steps, exploring = env.reset(), 0, bool(adaptation.explorer.exploring()[0])
+        obs, n_steps, exploring = env.reset(), 0, bool(adaptation.exploring()[0])
         yield begin()
         act = partial(adaptation.act, deterministic=self.deterministic)
         for step in adaptation_steps(env, adaptation, n_episodes, policy.unscale_action, act, obs):
@@ -150,7 +150,7 @@ class Player:
             successes[-1] |= step.infos[0]["is_success"]
             yield moment(n_steps, exploring, ended)
             if ended:
-                n_steps, exploring = 0, bool(adaptation.explorer.exploring()[0])
+                n_steps, exploring = 0, bool(adaptation.exploring()[0])
                 if len(returns) < n_episodes:
                     yield begin()
 
@@ -163,7 +163,8 @@ def line(moment: Moment) -> str:
     how = "explores" if moment.exploring else "adapted"
     solved = "solved" if moment.successes[-1] else "-"
     score = f"return {moment.returns[-1]:8.2f}   {solved:<6}"
-    return f"  episode {moment.episode:3d}   {how:<8}   {score}   uncertainty of z {moment.deviation:.2f}"
+    known = "" if np.isnan(moment.deviation) else f"   uncertainty of z {moment.deviation:.2f}"
+    return f"  episode {moment.episode:3d}   {how:<8}   {score}{known}"
 
 
 def summary(ends: list[Moment]) -> str:

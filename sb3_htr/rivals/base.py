@@ -1,0 +1,153 @@
+"""What the rivals share: they train on the envs of PEARL, are evaluated as PEARL is, and go on from the same checkpoints."""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_htr.adaptation.adaptation import Step
+from sb3_htr.adaptation.loop import Adapts
+from sb3_htr.common.saving import AtomicSave
+from sb3_htr.common.training_state import get_training_state, set_random_state, set_training_state
+
+COUNTERS = ("num_timesteps", "_episode_num", "_n_updates", "_current_progress_remaining")
+
+
+class OwnWay:
+    """In the place of an explorer."""
+
+    name = "own"
+
+
+class RivalAdaptation:
+    """
+    Keeps what anybody can see of an adaptation; a subclass adds ``act``.
+
+    :param n_envs: number of tasks
+    """
+
+    def __init__(self, n_envs: int) -> None:
+        self.n_envs = n_envs
+        self._found = np.zeros(n_envs, dtype=bool)
+
+    def observe(self, step: Step) -> None:
+        """
+        :param step: what each env did
+        """
+        self._found |= [bool(info["is_success"]) for info in step.infos]
+
+    def exploring(self) -> np.ndarray:
+        """
+        :return: (n_envs,) bool, whether the task was not solved yet; for those who watch, the agent is not told
+        """
+        return ~self._found
+
+    def deviation(self) -> np.ndarray:
+        """
+        :return: (n_envs,) NaN: there is no z
+        """
+        return np.full(self.n_envs, np.nan)
+
+
+class FreshStart(BaseCallback):
+    """Resets all envs where a rollout begins, after other callbacks had a look: so that nothing of an env need be saved."""
+
+    model: "Rival"
+
+    def _on_rollout_start(self) -> None:
+        self.model.begin_rollout()
+
+    def _on_step(self) -> bool:
+        return True
+
+
+class Rival(AtomicSave, BaseAlgorithm):
+    """
+    A mixin for algorithms of Stable-Baselines3. It is made as :class:`sb3_htr.PEARL` is: of a policy and an env of a task
+    family. What the algorithm needs around the env is put there by its ``_wrap_env``.
+
+    A rollout begins with a reset of all envs, as PEARL's do, so that a training that goes on from a checkpoint is the same as
+    one that was never interrupted, bit for bit.
+    """
+
+    #: Policy of a file that does not say its own
+    DEFAULT_POLICY: ClassVar[str]
+    #: Settings that an agent which is loaded to act needs
+    ACTS_BY: ClassVar[tuple[str, ...]] = ("policy_kwargs",)
+    explorer = OwnWay()
+    #: Of a training that goes on: takes effect once learn() has set everything up, which draws random numbers
+    _pending_random: dict[str, Any] | None = None
+
+    @property
+    def update_listeners(self) -> list[Callable[[], None]]:
+        """Nobody is told of single updates."""
+        return []
+
+    @abstractmethod
+    def _adaptation(self, n_envs: int, generator: th.Generator | None) -> Adapts:
+        """An adaptation to so many tasks, side by side."""
+
+    def start_adaptation(self, n_envs: int, explorer: Any = None, generator: th.Generator | None = None) -> Adapts:
+        """
+        :param n_envs: number of tasks to adapt to side by side
+        :param explorer: None or ``"own"``: it explores in its own way
+        :param generator: source of randomness; torch's global one by default
+        :return: acts, and takes in what happens
+        :raises ValueError: for an explorer
+        """
+        if explorer not in (None, OwnWay.name):
+            raise ValueError(f"{type(self).__name__} has no explorers, but the explorer is {explorer!r}: leave it away.")
+        return self._adaptation(n_envs, generator)
+
+    def begin_rollout(self) -> None:
+        """Begin new episodes in all envs."""
+        assert self.env is not None
+        self._last_obs = self.env.reset()  # type: ignore[assignment]
+        self._last_episode_starts = np.ones(self.env.num_envs, dtype=bool)
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        with_start = CallbackList([super()._init_callback(callback, progress_bar), FreshStart()])
+        with_start.init_callback(self)
+        return with_start
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        result = super()._setup_learn(*args, **kwargs)
+        if self._pending_random is not None:
+            assert self.env is not None
+            set_random_state(self.env, self._pending_random)
+            self._pending_random = None
+        return result
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: everything that a training in progress is, between two rollouts, for :meth:`load_state_dict`
+        """
+        return get_training_state(self, COUNTERS)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        The random generators follow when ``learn(remaining steps, reset_num_timesteps=False)`` begins.
+
+        :param state: of :meth:`state_dict` of a model with the same settings
+        """
+        set_training_state(self, state)
+        self._pending_random = state["random"]
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_pending_random"]
+
+
+def scaled(actions: np.ndarray, env: VecEnv) -> np.ndarray:
+    """
+    :param actions: (n, action_dim), in the bounds of the action space
+    :param env: has the action space, a Box
+    :return: (n, action_dim) float32, scaled to [-1, 1]
+    """
+    low, high = env.action_space.low, env.action_space.high  # type: ignore[attr-defined]
+    return np.asarray(2.0 * (actions - low) / (high - low) - 1.0, dtype=np.float32)

@@ -1,0 +1,153 @@
+"""RL2: a recurrent policy whose memory is its adaptation, trained by sb3-contrib's RecurrentPPO."""
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from sb3_contrib import RecurrentPPO
+from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_htr.adaptation.adaptation import Step
+from sb3_htr.adaptation.loop import Adapts
+from sb3_htr.common.checks import check_numbers
+from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.rivals.base import Rival, RivalAdaptation
+from sb3_htr.rivals.trials import LastStep, TrialVecEnv
+
+N_EPISODES_PER_TRIAL = 5
+# Of an env that is given by its id
+N_ENVS = 20
+
+
+class TrialAdaptation(RivalAdaptation):
+    """
+    A trial in several envs. Episodes beyond a trial's length repeat its last one: the memory is each time what it was when the
+    last one began, because training has shown it no more.
+
+    :param policy: recurrent policy
+    :param n_envs: number of tasks
+    :param n_episodes_per_trial: episodes of a trial in training
+    """
+
+    def __init__(self, policy: RecurrentActorCriticPolicy, n_envs: int, n_episodes_per_trial: int) -> None:
+        super().__init__(n_envs)
+        self.policy = policy
+        self.n_episodes_per_trial = n_episodes_per_trial
+        self._last = LastStep(n_envs, policy.action_space.shape[0])  # type: ignore[index]
+        self._n_episodes = np.zeros(n_envs, dtype=np.int64)
+        lstm = policy.lstm_actor
+        # Hidden and cell state; and what they and the last step were when the last episode of a trial began
+        self._memory = np.zeros((2, lstm.num_layers, n_envs, lstm.hidden_size), dtype=np.float32)
+        self._kept_memory, self._kept_last = self._memory.copy(), self._last.columns.copy()
+
+    def act(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
+        """
+        :param obs: (n_envs, obs_dim)
+        :param deterministic: mean actions instead of samples
+        :return: (n_envs, action_dim), scaled to [-1, 1]
+        """
+        begins = np.zeros(self.n_envs, dtype=bool)
+        actions, memory = self.policy.predict(
+            self._last.beside(obs), (self._memory[0], self._memory[1]), begins, deterministic
+        )
+        assert memory is not None
+        self._memory = np.stack(memory)
+        return self.policy.scale_action(actions)
+
+    def observe(self, step: Step) -> None:
+        """
+        :param step: what each env did
+        """
+        super().observe(step)
+        self._last.take_in(step.actions, step.rewards, step.dones)
+        ended = np.flatnonzero(step.dones)
+        self._n_episodes[ended] += 1
+        last = ended[self._n_episodes[ended] == self.n_episodes_per_trial - 1]
+        self._kept_memory[:, :, last], self._kept_last[last] = self._memory[:, :, last], self._last.columns[last]
+        beyond = ended[self._n_episodes[ended] >= self.n_episodes_per_trial]
+        self._memory[:, :, beyond], self._last.columns[beyond] = self._kept_memory[:, :, beyond], self._kept_last[beyond]
+
+
+class RL2(Rival, RecurrentPPO):
+    """
+    RL2: a recurrent policy that is trained to do well over a whole trial, several episodes on one task, so that it learns to find
+    out in the first ones what the last ones need. Its observation has its last action, the last reward and whether an episode
+    begins in it, see :class:`sb3_htr.rivals.trials.TrialVecEnv`; its memory lives as long as a trial.
+
+    Papers: https://arxiv.org/abs/1611.02779, https://arxiv.org/abs/1611.05763. The recurrent PPO is sb3-contrib's; a rollout is
+    whole trials. At meta-test, episodes beyond a trial's length repeat its last one, see :class:`TrialAdaptation`.
+
+    :param policy: ``"MlpLstmPolicy"`` or a class
+    :param env: env of a task family, VecEnv of such envs, or registered id
+    :param n_episodes_per_trial: episodes on each task. By RL2's objective all of them count, and the critic looks beyond their
+        ends
+    :param n_trials_per_rollout: trials of each env between two updates
+    :param seed: seed of all random generators
+    :param kwargs: arguments of ``RecurrentPPO`` but ``n_steps``, which follows
+    :raises ValueError: for an env without tasks or time limit, or a number that is out of its range
+    """
+
+    DEFAULT_POLICY: ClassVar[str] = "MlpLstmPolicy"
+    ACTS_BY: ClassVar[tuple[str, ...]] = ("policy_kwargs", "n_episodes_per_trial")
+    policy: RecurrentActorCriticPolicy
+    env: TrialVecEnv | None  # type: ignore[assignment]
+
+    def __init__(
+        self,
+        policy: str | type[RecurrentActorCriticPolicy],
+        env: GymEnv | str | None,
+        n_episodes_per_trial: int = N_EPISODES_PER_TRIAL,
+        n_trials_per_rollout: int = 4,
+        seed: int | None = None,
+        **kwargs: Any,
+    ) -> None:
+        infinity = float("inf")
+        check_numbers(
+            n_episodes_per_trial=(n_episodes_per_trial, 1, infinity), n_trials_per_rollout=(n_trials_per_rollout, 1, infinity)
+        )
+        if "n_steps" in kwargs:
+            raise ValueError("n_steps follows from n_trials_per_rollout: a rollout is whole trials.")
+        if isinstance(env, str):
+            env = make_task_vec_env(env, N_ENVS, seed)
+        n_steps = 1
+        if env is not None:
+            env = self._wrap_env(env)
+            assert isinstance(env, TrialVecEnv)
+            env.n_episodes = n_episodes_per_trial
+            n_steps = n_trials_per_rollout * env.max_trial_steps
+        self.n_episodes_per_trial = n_episodes_per_trial
+        self.n_trials_per_rollout = n_trials_per_rollout
+        super().__init__(policy=policy, env=env, n_steps=n_steps, seed=seed, **kwargs)
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        if isinstance(env, TrialVecEnv):
+            return env
+        return TrialVecEnv(RecurrentPPO._wrap_env(env, verbose, monitor_wrapper), N_EPISODES_PER_TRIAL)
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self._set_trials()
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        :param env: env of the same spaces and number of copies
+        :param force_reset: reset before training goes on
+        """
+        super().set_env(env, force_reset)
+        self._set_trials()
+
+    def _set_trials(self) -> None:
+        if self.env is not None:
+            self.env.n_episodes = self.n_episodes_per_trial
+
+    def dump_logs(self, iteration: int = 0) -> None:
+        """
+        :param iteration: not used: rollouts are counted from the beginning of the training, which may have been resumed
+        """
+        super().dump_logs(self.num_timesteps // (self.n_steps * self.n_envs))
+
+    def _adaptation(self, n_envs: int, generator: th.Generator | None) -> Adapts:
+        return TrialAdaptation(self.policy, n_envs, self.n_episodes_per_trial)

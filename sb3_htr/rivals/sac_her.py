@@ -1,0 +1,295 @@
+"""SAC with hindsight experience replay, told its task: the ceiling for agents that have to find it out."""
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import DictReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import DictReplayBufferSamples, GymEnv, RolloutReturn
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+from stable_baselines3.her import HerReplayBuffer
+from stable_baselines3.sac import SAC
+from stable_baselines3.sac.policies import SACPolicy
+
+from sb3_htr.adaptation.loop import Adapts
+from sb3_htr.common.checks import check_numbers, check_spaces, get_max_episode_steps, get_task_family
+from sb3_htr.common.type_aliases import TaskFamily, Trajectory
+from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.rivals.base import Rival, RivalAdaptation
+
+# Of an env that is given by its id
+N_ENVS = 20
+
+
+class ShownTask:
+    """
+    The observation of an agent that is told its task, as SB3's HER has it: ``observation``, ``achieved_goal``, the task that
+    the state solves, and ``desired_goal``, the task to solve.
+
+    :param family: whose tasks are functions of a state
+    :param action_space: Box
+    """
+
+    def __init__(self, family: TaskFamily, action_space: spaces.Box) -> None:
+        self.family = family
+        self._action_dim = action_space.shape[0]
+
+    def space(self, observation_space: spaces.Box) -> spaces.Dict:
+        """
+        :param observation_space: of the env
+        :return: of the agent
+        """
+        goal = spaces.Box(-np.inf, np.inf, self.family.train_tasks.shape[1:], np.float32)
+        return spaces.Dict({"observation": observation_space, "achieved_goal": goal, "desired_goal": goal})
+
+    def achieved(self, obs: np.ndarray) -> np.ndarray:
+        """
+        :param obs: (n, obs_dim)
+        :return: (n, task_dim), the tasks that these states solve
+        """
+        obs, nothing = obs[:, None], np.zeros((len(obs), 1, self._action_dim), dtype=np.float32)
+        return self.family.hindsight_task(Trajectory(obs, nothing, obs, nothing[..., 0]), 0)
+
+    def __call__(self, obs: np.ndarray, tasks: np.ndarray) -> dict[str, np.ndarray]:
+        """
+        :param obs: (n, obs_dim)
+        :param tasks: (n, task_dim)
+        :return: what the agent sees
+        """
+        return {"observation": obs, "achieved_goal": self.achieved(obs), "desired_goal": tasks}
+
+
+class ShownTaskVecEnv(VecEnvWrapper):
+    """
+    Shows the task, which the env draws for each episode.
+
+    :param venv: env of a task family
+    :raises ValueError: if the env has no tasks
+    """
+
+    def __init__(self, venv: VecEnv) -> None:
+        check_spaces(venv)
+        assert isinstance(venv.observation_space, spaces.Box) and isinstance(venv.action_space, spaces.Box)
+        self.shown = ShownTask(get_task_family(venv), venv.action_space)
+        super().__init__(venv, observation_space=self.shown.space(venv.observation_space))
+
+    def _tasks(self) -> np.ndarray:
+        return np.stack(self.venv.get_attr("task"))
+
+    def reset(self) -> VecEnvObs:
+        """Begin an episode in each env."""
+        obs = self.venv.reset()
+        assert isinstance(obs, np.ndarray)
+        self._now = self._tasks()
+        return self.shown(obs, self._now)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        obs, rewards, dones, infos = self.venv.step_wait()
+        assert isinstance(obs, np.ndarray)
+        before, ended = self._now, np.flatnonzero(dones)
+        self._check(obs, dones, infos)
+        if len(ended):
+            self._now = self._tasks()
+            final = self.shown(np.stack([infos[env]["terminal_observation"] for env in ended]), before[ended])
+            for i, env in enumerate(ended):
+                infos[env]["terminal_observation"] = {key: values[i] for key, values in final.items()}
+        return self.shown(obs, self._now), rewards, dones, infos
+
+    def _check(self, obs: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        going_on = np.flatnonzero(~dones)
+        told = np.array([infos[env]["achieved_task"] for env in going_on], dtype=np.float32)
+        if len(told) and not np.allclose(told, self.shown.achieved(obs[going_on]), rtol=1e-4, atol=1e-5):
+            raise ValueError(
+                f"The tasks of {type(self.shown.family).__name__} are no functions of a state: the task that a step achieves "
+                "cannot be read in the observation after it, so there is no achieved_goal for HER."
+            )
+
+
+class TaskHerReplayBuffer(HerReplayBuffer):
+    """
+    SB3's HER, with the reward hook of the task family, which rewards a whole step and not its achieved goal alone.
+    """
+
+    def _get_virtual_samples(
+        self, batch_indices: np.ndarray, env_indices: np.ndarray, env: VecNormalize | None = None
+    ) -> DictReplayBufferSamples:
+        assert isinstance(self.env, ShownTaskVecEnv) and isinstance(self.action_space, spaces.Box)
+        at, space = (batch_indices, env_indices), self.action_space
+        own, goals = self.next_observations["desired_goal"][at], self._sample_goals(batch_indices, env_indices)
+        obs, next_obs = self.observations["observation"][at], self.next_observations["observation"][at]
+        actions = space.low + 0.5 * (self.actions[at] + 1.0) * (space.high - space.low)
+        step = Trajectory(*(x[:, None] for x in (obs, actions, next_obs, np.zeros(len(obs), dtype=np.float32))))
+        # What a step earned beside its own task stays
+        family = self.env.shown.family
+        rewards = self.rewards[at] + (family.compute_reward(step, goals) - family.compute_reward(step, own))[:, 0]
+        real, shown = self._get_real_samples(batch_indices, env_indices, env), self.to_torch(goals)
+        return real._replace(
+            observations={**real.observations, "desired_goal": shown},
+            next_observations={**real.next_observations, "desired_goal": shown},
+            rewards=self.to_torch(rewards[:, None]),
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: tensors and numbers, for :meth:`load_state_dict`
+        """
+        end = self.buffer_size if self.full else self.pos
+        arrays = {name: th.from_numpy(array[:end].copy()) for name, array in self._arrays().items()}
+        return {"arrays": arrays, "begun": th.tensor(self._current_ep_start), "pos": self.pos, "full": self.full}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: of :meth:`state_dict` of a buffer with the same settings
+        """
+        for name, array in self._arrays().items():
+            saved = state["arrays"][name].cpu().numpy()
+            array[: len(saved)] = saved
+        self._current_ep_start = state["begun"].cpu().numpy().copy()
+        self.pos, self.full = state["pos"], state["full"]
+
+    def _arrays(self) -> dict[str, np.ndarray]:
+        plain = ("actions", "rewards", "dones", "timeouts", "ep_start", "ep_length")
+        return {
+            **{name: getattr(self, name) for name in plain},
+            **{f"observations/{key}": array for key, array in self.observations.items()},
+            **{f"next_observations/{key}": array for key, array in self.next_observations.items()},
+        }
+
+
+class ToldAdaptation(RivalAdaptation):
+    """
+    No adaptation at all: the agent is told the task.
+
+    :param policy: for the observations of ``shown``
+    :param n_envs: number of tasks
+    :param shown: makes them
+    """
+
+    def __init__(self, policy: SACPolicy, n_envs: int, shown: ShownTask) -> None:
+        super().__init__(n_envs)
+        self.policy = policy
+        self.shown = shown
+
+    def see_tasks(self, tasks: np.ndarray) -> None:
+        """
+        :param tasks: (n_envs, task_dim)
+        """
+        self._tasks = tasks
+
+    def act(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
+        """
+        :param obs: (n_envs, obs_dim)
+        :param deterministic: mean actions instead of samples
+        :return: (n_envs, action_dim), scaled to [-1, 1]
+        """
+        actions, _ = self.policy.predict(self.shown(obs, self._tasks), deterministic=deterministic)
+        return self.policy.scale_action(actions)
+
+
+class SACHER(Rival, SAC):
+    """
+    SAC with HER, whose observation has the task in it: how well the family can be solved by an agent that knows its task, of the
+    same library and trained on the same sparse rewards. Papers: https://arxiv.org/abs/1812.05905,
+    https://arxiv.org/abs/1707.01495.
+
+    It takes every family whose tasks are functions of a state: the task that a step achieves must be the same whatever the
+    observation before it and the action are. Others are refused in their first step.
+
+    A rollout is one episode of each env, or as many steps where episodes end early.
+
+    :param policy: ``"MultiInputPolicy"`` or a class
+    :param env: env of a task family, VecEnv of such envs, or registered id
+    :param gradient_steps: updates after each rollout, -1 for as many as it had env steps
+    :param replay_buffer_kwargs: arguments of SB3's ``HerReplayBuffer``
+    :param seed: seed of all random generators
+    :param kwargs: arguments of ``SAC`` but ``train_freq`` and ``replay_buffer_class``
+    :raises ValueError: for an env without tasks or time limit
+    """
+
+    DEFAULT_POLICY: ClassVar[str] = "MultiInputPolicy"
+
+    def __init__(
+        self,
+        policy: str | type[SACPolicy],
+        env: GymEnv | str | None,
+        gradient_steps: int = -1,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        seed: int | None = None,
+        **kwargs: Any,
+    ) -> None:
+        check_numbers(gradient_steps=(gradient_steps, -1, float("inf")))
+        for name in ("train_freq", "replay_buffer_class"):
+            if name in kwargs:
+                raise ValueError(f"SACHER has no setting {name!r}: a rollout is an episode of each env, and replay is HER's.")
+        if isinstance(env, str):
+            env = make_task_vec_env(env, N_ENVS, seed)
+        n_steps = 1
+        if env is not None:
+            env = self._wrap_env(env)
+            n_steps = get_max_episode_steps(env)
+        super().__init__(
+            policy=policy,
+            env=env,  # type: ignore[arg-type]
+            train_freq=(n_steps, "step"),
+            gradient_steps=gradient_steps,
+            replay_buffer_class=TaskHerReplayBuffer,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            seed=seed,
+            **kwargs,
+        )
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        if isinstance(env, ShownTaskVecEnv):
+            return env
+        return ShownTaskVecEnv(SAC._wrap_env(env, verbose, monitor_wrapper))
+
+    def _setup_model(self) -> None:
+        if self.env is None:
+            # Loaded for prediction only: SB3 wants a buffer, we want no memory of it
+            self.replay_buffer = DictReplayBuffer(1, self.observation_space, self.action_space)  # type: ignore[arg-type]
+            super()._setup_model()
+            self.replay_buffer = None
+        else:
+            super()._setup_model()
+            assert isinstance(self.env, ShownTaskVecEnv)
+            self.shown = self.env.shown
+
+    def begin_rollout(self) -> None:
+        """Begin new episodes in all envs."""
+        super().begin_rollout()
+        buffer = self.replay_buffer
+        assert isinstance(buffer, TaskHerReplayBuffer)
+        if (buffer._current_ep_start != buffer.pos).any():
+            buffer.truncate_last_trajectory()
+
+    def collect_rollouts(self, env: VecEnv, callback: BaseCallback, *args: Any, **kwargs: Any) -> RolloutReturn:
+        """As SAC's, logged rollout by rollout instead of episode by episode."""
+        log_interval = kwargs.pop("log_interval", None)
+        rollout = super().collect_rollouts(env, callback, *args, **kwargs)
+        if log_interval is not None and rollout.continue_training:
+            self.dump_logs()
+        return rollout
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: everything that a training in progress is, between two rollouts, for :meth:`load_state_dict`
+        """
+        assert isinstance(self.replay_buffer, TaskHerReplayBuffer)
+        return {**super().state_dict(), "replay": self.replay_buffer.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        The random generators follow when ``learn(remaining steps, reset_num_timesteps=False)`` begins.
+
+        :param state: of :meth:`state_dict` of a model with the same settings
+        """
+        super().load_state_dict(state)
+        assert isinstance(self.replay_buffer, TaskHerReplayBuffer)
+        self.replay_buffer.load_state_dict(state["replay"])
+
+    def _adaptation(self, n_envs: int, generator: th.Generator | None) -> Adapts:
+        return ToldAdaptation(self.policy, n_envs, self.shown)

@@ -1,0 +1,123 @@
+"""RL2's trials: several episodes on one task, seen by an agent as one."""
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+
+from sb3_htr.common.checks import check_numbers, check_spaces, get_max_episode_steps, get_task_family
+from sb3_htr.rivals.base import scaled
+
+
+class LastStep:
+    """
+    What RL2's policy sees beside the observation: its last action, the last reward, and whether an episode begins.
+
+    :param n_envs: number of envs
+    :param action_dim: length of an action
+    """
+
+    def __init__(self, n_envs: int, action_dim: int) -> None:
+        #: (n_envs, action_dim + 2) float32
+        self.columns = np.zeros((n_envs, action_dim + 2), dtype=np.float32)
+        self.forget(np.arange(n_envs))
+
+    def forget(self, envs: np.ndarray) -> None:
+        """
+        :param envs: (k,) int, where a trial begins
+        """
+        self.columns[envs] = 0
+        self.columns[envs, -1] = 1
+
+    def take_in(self, actions: np.ndarray, rewards: np.ndarray, dones: np.ndarray) -> None:
+        """
+        :param actions: (n_envs, action_dim), scaled to [-1, 1]
+        :param rewards: (n_envs,)
+        :param dones: (n_envs,) bool, where an episode has ended
+        """
+        self.columns[:, :-2], self.columns[:, -2], self.columns[:, -1] = actions, rewards, dones
+
+    def beside(self, obs: np.ndarray) -> np.ndarray:
+        """
+        :param obs: (n_envs, obs_dim)
+        :return: (n_envs, obs_dim + action_dim + 2) float32
+        """
+        return np.concatenate([obs, self.columns], axis=1, dtype=np.float32)
+
+
+class TrialVecEnv(VecEnvWrapper):
+    """
+    Each episode of it is a trial: ``n_episodes`` episodes of the env on one training task, which the env draws. An observation
+    is that of the env with :class:`LastStep` beside it. A trial's end is a true end, whatever its last episode ended with.
+
+    :param venv: env of a task family
+    :param n_episodes: episodes of a trial
+    """
+
+    def __init__(self, venv: VecEnv, n_episodes: int) -> None:
+        check_numbers(n_episodes=(n_episodes, 1, float("inf")))
+        check_spaces(venv)
+        get_task_family(venv)
+        obs, action = venv.observation_space, venv.action_space
+        assert isinstance(obs, spaces.Box) and isinstance(action, spaces.Box)
+        action_dim = action.shape[0]
+        low, high = np.append(-np.ones(action_dim), [-np.inf, 0]), np.append(np.ones(action_dim), [np.inf, 1])
+        space = spaces.Box(*(np.append(a, b).astype(np.float32) for a, b in ((obs.low, low), (obs.high, high))))
+        super().__init__(venv, observation_space=space)
+        self.n_episodes = n_episodes
+        self._episode = np.zeros(self.num_envs, dtype=np.int64)
+        self._last = LastStep(self.num_envs, action_dim)
+
+    @property
+    def max_trial_steps(self) -> int:
+        """Steps of a trial, at most."""
+        return self.n_episodes * get_max_episode_steps(self.venv)
+
+    def reset(self) -> VecEnvObs:
+        """Begin a trial in each env."""
+        self.venv.env_method("set_task", None)
+        obs = self.venv.reset()
+        assert isinstance(obs, np.ndarray)
+        self._episode[:] = 0
+        self._last.forget(np.arange(self.num_envs))
+        self._arrange(np.arange(self.num_envs))
+        return self._last.beside(obs)
+
+    def _arrange(self, envs: np.ndarray) -> None:
+        """Where an episode has just begun: keep its task for the trial, and in the last one let the env draw the next."""
+        for env in envs:
+            if self._episode[env] == self.n_episodes - 1:
+                self.venv.env_method("set_task", None, indices=int(env))
+            elif self._episode[env] == 0:
+                (task,) = self.venv.get_attr("task_id", indices=int(env))
+                self.venv.env_method("set_task", int(task), indices=int(env))
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self._actions = actions
+        self.venv.step_async(actions)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        obs, rewards, dones, infos = self.venv.step_wait()
+        assert isinstance(obs, np.ndarray)
+        self._last.take_in(scaled(self._actions, self.venv), rewards, dones)
+        ended = np.flatnonzero(dones)
+        trial_ends = np.zeros(self.num_envs, dtype=bool)
+        if len(ended):
+            self._episode[ended] += 1
+            over = ended[self._episode[ended] == self.n_episodes]
+            trial_ends[over] = True
+            self._end(over, obs, infos)
+            self._arrange(ended)
+        return self._last.beside(obs), rewards, trial_ends, infos
+
+    def _end(self, envs: np.ndarray, obs: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        """Trials that are over."""
+        final_obs = obs.copy()
+        final_obs[envs] = [infos[env]["terminal_observation"] for env in envs]
+        final = self._last.beside(final_obs)
+        for env in envs:
+            infos[env] |= {"terminal_observation": final[env], "TimeLimit.truncated": False}
+        self._episode[envs] = 0
+        self._last.forget(envs)

@@ -1,0 +1,94 @@
+"""What the zoo has to know of an algorithm: where it is, what its settings are, and how a model of it is loaded."""
+
+import importlib
+import json
+import os
+import zipfile
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import torch as th
+from stable_baselines3.common.save_util import load_from_zip_file
+
+from sb3_htr.pearl import PEARL, load_untrusted
+from sb3_htr.rivals.base import Rival
+from sb3_htr.zoo.run.shipped import hyperparams_file
+
+# What a run trains and a command adapts
+Model = PEARL | Rival
+# What a file of weights may unpack to
+MAX_BYTES = 2**30
+
+
+@dataclass(frozen=True)
+class Algorithm:
+    """
+    :param name: rl_zoo3's ``--algo``
+    :param module: that its class is in, imported when it is needed
+    :param class_name: of the class
+    :param settings: YAML file with its hyperparameters
+    :param has_explorers: whether it has explorers, and is searched for hyperparameters
+    """
+
+    name: str
+    module: str
+    class_name: str
+    settings: str
+    has_explorers: bool = False
+
+    @property
+    def settings_file(self) -> str:
+        """Path of the YAML file."""
+        return str(hyperparams_file(self.settings))
+
+    def model_class(self) -> type[Any]:
+        """
+        :return: the class
+        :raises ModuleNotFoundError: if a package that it needs is not installed
+        """
+        model_class: type[Any] = getattr(importlib.import_module(self.module), self.class_name)
+        return model_class
+
+    def load(self, path: str | os.PathLike[str], record: dict[str, Any], env: gym.Env, device: str, trust: bool) -> Model:
+        """
+        :param path: model file
+        :param record: of its training
+        :param env: env of the same spaces
+        :param device: torch device
+        :param trust: unpickle all of the file, which can run any code
+        :return: a model to adapt and evaluate with
+        :raises ValueError: if it is no such file
+        """
+        model_class = self.model_class()
+        if trust:
+            return model_class.load(path, device=device)  # type: ignore[no-any-return]
+        if model_class is PEARL:
+            return load_untrusted(path, env, device)
+        # A new model with the plain settings of the record, and the weights of the file
+        given = record.get("hyperparams", {})
+        settings = {name: given[name] for name in model_class.ACTS_BY if name in given}
+        try:
+            with zipfile.ZipFile(path) as archive:
+                if sum(info.file_size for info in archive.infolist()) > MAX_BYTES:
+                    raise ValueError(f"it unpacks to more than {MAX_BYTES} bytes")
+                n_steps = json.loads(archive.read("data")).get("num_timesteps", 0)
+            model: Rival = model_class(given.get("policy", model_class.DEFAULT_POLICY), env, device=device, **settings)
+            _, weights, _ = load_from_zip_file(path, load_data=False, device=model.device)
+            model.set_parameters({"policy": weights["policy"]}, exact_match=False, device=model.device)
+        except (KeyError, RuntimeError, AttributeError, zipfile.BadZipFile, json.JSONDecodeError) as error:
+            raise ValueError(f"{path} is damaged, or no model of {self.name} with the settings of its record: {error}") from None
+        model.num_timesteps = n_steps if type(n_steps) is int else 0
+        return model
+
+
+ALGORITHMS = {
+    algorithm.name: algorithm
+    for algorithm in (
+        Algorithm("pearl", "sb3_htr.pearl", "PEARL", "pearl.yml", has_explorers=True),
+        Algorithm("rl2", "sb3_htr.rivals.rl2", "RL2", "rl2.yml"),
+        Algorithm("sac-her", "sb3_htr.rivals.sac_her", "SACHER", "sac_her.yml"),
+        Algorithm("random", "sb3_htr.rivals.untrained", "RandomAgent", "untrained.yml"),
+        Algorithm("scripted", "sb3_htr.rivals.untrained", "ScriptedAgent", "untrained.yml"),
+    )
+}
