@@ -7,6 +7,7 @@ import torch as th
 
 from sb3_htr.adaptation.context import evenly_spread
 from sb3_htr.common.random_state import get_generator_state, set_generator_state
+from sb3_htr.common.task_reward import ROUNDING
 from sb3_htr.common.type_aliases import TaskFamily
 from sb3_htr.htr.transitions import Transitions
 
@@ -119,8 +120,7 @@ class TaskBank:
         # 0 or clearly more: the reward without the task-free part is a difference of float32
         returns = np.where(success, reward, 0.0).sum(axis=-1, dtype=np.float32)
         best = returns.argmax(axis=0)
-        # A little more, because of rounding
-        better = np.flatnonzero(returns.max(axis=0) > self.best_return + 1e-5)
+        better = np.flatnonzero(returns.max(axis=0) > self.best_return + ROUNDING)
         self.best_return[better] = returns[best[better], better]
         steps, taken = evenly_spread(length[best[better]], self.context_size)
         self.length[better] = taken

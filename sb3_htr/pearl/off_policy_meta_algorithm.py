@@ -327,7 +327,7 @@ class OffPolicyMetaAlgorithm(SAC):
         :param means: (n, latent_dim), posterior means of recent meta-batches
         """
         assert self.task_bank is not None
-        self.knowledge.learn(self.policy, means, self.task_bank)
+        self.knowledge.learn(self.policy, means, self.task_bank, self.gamma)
 
     # Meta-test
 

@@ -12,12 +12,12 @@ from helpers import ENV_ID, PRIOR, ROLLOUT, MakePEARL
 from helpers.adaptations import know_tasks
 from htr_envs import PointRobotFamily
 from sb3_htr import PEARL, evaluate_adaptation
-from sb3_htr.adaptation import Prior, Search
+from sb3_htr.adaptation import Belief, Prior
 from sb3_htr.adaptation.evaluation import record_adaptation
 from sb3_htr.common.vec_env import make_task_vec_env
 
 
-@pytest.mark.parametrize("explorer", ["prior", "aggregate", "search"])
+@pytest.mark.parametrize("explorer", ["prior", "aggregate", "belief", "learned-prior"])
 def test_meta_evaluation_works_before_any_training(tiny_pearl: MakePEARL, explorer: str) -> None:
     returns, successes = evaluate_adaptation(tiny_pearl(), ENV_ID, n_episodes=3, explorer=explorer)
     assert returns.shape == successes.shape == (100, 3)
@@ -32,8 +32,8 @@ def test_an_explorer_may_be_a_name_a_name_with_settings_or_an_object(tiny_pearl:
     results += [evaluate_adaptation(tiny_pearl(), ENV_ID, task, 3, explorer=explorer)[0] for explorer in given]
     for returns in results[1:]:
         np.testing.assert_array_equal(returns, results[0])
-    model = tiny_pearl(explorer=Search(scale=2.0), train_explorer={"name": "prior", "n_exploration_episodes": 3})
-    assert model.explorer == Search(scale=2.0) and model.train_explorer == Prior(3)
+    model = tiny_pearl(explorer=Belief(margin=2.0), train_explorer={"name": "prior", "n_exploration_episodes": 3})
+    assert model.explorer == Belief(margin=2.0) and model.train_explorer == Prior(3)
     env = gym.make(ENV_ID, goal_distance=5.0)
     with pytest.warns(UserWarning, match="No reward"):
         agents = [model.adapt(env, 1, task[0] * 9, explorer=explorer) for explorer in given]

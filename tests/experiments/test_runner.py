@@ -29,7 +29,7 @@ SMALL: dict[str, Any] = {
 
 def test_a_killed_run_of_an_experiment_goes_on(tmp_path: Path) -> None:
     variant = Variant("htr-ser", "tiny", SMALL)
-    experiment = Experiment("", "SparsePointRobot-v0", 1200, (variant,), 1, 480, ("search",))
+    experiment = Experiment("", "SparsePointRobot-v0", 1200, (variant,), 1, 480, ("belief",))
     (cell,) = experiment.cells()
     command = cell.command(tmp_path / cell.name)
     killed = subprocess.run([*command, "--save-freq", "1"], check=False, capture_output=True, text=True)
@@ -40,7 +40,7 @@ def test_a_killed_run_of_an_experiment_goes_on(tmp_path: Path) -> None:
     result = run_cell(cell, tmp_path)
     assert f"Going on from {run / 'checkpoints' / steps}" in (tmp_path / cell.name / "log.txt").read_text()
     raw = np.load(result)
-    assert raw["returns_search"].shape == (100, 20) and raw["timesteps"].tolist() == [480, 960]
+    assert raw["returns_belief"].shape == (100, 20) and raw["timesteps"].tolist() == [480, 960]
     assert len(list((tmp_path / cell.name).glob("*/*"))) == 1
     changed = result.stat().st_mtime_ns
     assert run_cell(cell, tmp_path) == result and result.stat().st_mtime_ns == changed, "a result is not made again"

@@ -46,7 +46,7 @@ class Counter(BaseCallback):
         {"ent_coef": "auto"},
         {"learning_rate": lambda remaining: 1e-3 * remaining},
         {"target_update_interval": 2, "explorer": PRIOR, "train_explorer": PRIOR},
-        {"train_explorer": "search"},
+        {"train_explorer": "belief"},
         {"policy_kwargs": with_policy(normalize_observations=True)},
         {"replay_buffer_kwargs": {"relabel_probability": 0.0, "rl_reward_type": "dense"}},
         {"replay_buffer_kwargs": {"relabeller": {"name": "SingleEpisodeRelabelling", "hindsight_task_strategy": "final"}}},

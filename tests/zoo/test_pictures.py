@@ -117,6 +117,6 @@ def test_plot_draws_seeds_as_one_curve(
     with pytest.raises(ValueError, match="--labels needs one name of its own for each of the 2 folders"):
         main(["plot", *arguments, "-l", "same", "same"])
     with pytest.raises(ValueError, match=r"The runs in one differ in \['gamma'\]"):
-        make_run(folders[0], tiny_pearl(), 3, hyperparams={"explorer": {"name": "search"}, "gamma": 0.5})
+        make_run(folders[0], tiny_pearl(), 3, hyperparams={"explorer": {"name": "belief"}, "gamma": 0.5})
         main(["plot", *arguments])
     check_same_settings("none", [])

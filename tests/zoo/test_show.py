@@ -54,7 +54,7 @@ def test_enjoy_ends_with_its_window_or_its_steps(monkeypatch: pytest.MonkeyPatch
     assert capsys.readouterr().out.splitlines()[-2].startswith("  episode   2")
 
 
-@pytest.mark.parametrize("explorer", ["search", "prior", "aggregate"])
+@pytest.mark.parametrize("explorer", ["belief", "prior", "aggregate"])
 def test_what_is_played_is_what_is_evaluated(explorer: str) -> None:
     model, env = PEARL.load(SHIPPED), gym.make(ENV_ID)
     tasks = env.unwrapped.task_family.test_tasks  # type: ignore[attr-defined]
