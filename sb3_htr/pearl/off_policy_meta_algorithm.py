@@ -23,7 +23,6 @@ from stable_baselines3.sac import SAC
 
 from sb3_htr.adaptation.adaptation import Adaptation, Step
 from sb3_htr.adaptation.agent import AdaptedAgent
-from sb3_htr.adaptation.evaluation import run_adaptation
 from sb3_htr.adaptation.explorers import Explorer, to_explorer
 from sb3_htr.adaptation.knowledge import LatentKnowledge
 from sb3_htr.adaptation.loop import adaptation_steps
@@ -174,12 +173,14 @@ class OffPolicyMetaAlgorithm(SAC):
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """
-        :param seed: seed of python, numpy, torch, envs, rollout tasks and replay buffer
+        :param seed: seed of python, numpy, torch, envs, rollout tasks, replay buffer and task bank
         """
         super().set_random_seed(seed)
         self._rng = np.random.default_rng(seed)
         if isinstance(self.replay_buffer, MultiTaskReplayBuffer) and seed is not None:
             self.replay_buffer.seed(seed)
+        if self.task_bank is not None and seed is not None:
+            self.task_bank.seed(seed)
 
     # Meta-training
 
@@ -358,18 +359,20 @@ class OffPolicyMetaAlgorithm(SAC):
         seed: int = 0,
     ) -> AdaptedAgent:
         """
-        Adapt to one task by trying it.
+        Adapt to one task by trying it, from observations, actions and rewards.
 
-        :param env: env with the task, or an id
+        :param env: env with the task, or an id. It need not be of the task family that the model knows, or of any: an env of
+            the same spaces, such as the real robot, is enough, if its episodes are all of one task
         :param n_episodes: episodes to adapt in. The agent then acts with the z of the best one, or with a draw from its
             posterior where none was tried yet (explorer ``"prior"``: with a draw from the posterior over all of them)
         :param task: index of a training task or task vector; by default the task that the env has (if it has none yet, one
-            is drawn). The env keeps it.
+            is drawn). The env keeps it. An env without task family takes none
         :param explorer: an explorer, its name, or its name and settings; the model's own by default
         :param deterministic: adapt with mean actions instead of samples
         :param seed: seed of z
-        :return: an agent for this task, with the returns of its adaptation episodes
-        :raises ValueError: for several envs, an env without tasks or with other spaces, a task that the env does not have
+        :return: an agent for this task, with the returns of its adaptation episodes, and whether each was a success: if the
+            env does not say so (``info["is_success"]``), whether a reward was told from what is task-free
+        :raises ValueError: for several envs, an env with other spaces, a task that the env does not have
         """
         if n_episodes < 1:
             raise ValueError(f"n_episodes is {n_episodes}, expected at least 1.")
@@ -377,20 +380,27 @@ class OffPolicyMetaAlgorithm(SAC):
         if vec_env.num_envs != 1:
             raise ValueError(f"adapt() adapts to one task, but the VecEnv has {vec_env.num_envs} envs: pass a single env.")
         checks.check_is_not_normalized(vec_env)
-        checks.get_task_family(vec_env)
         check_for_correct_spaces(vec_env, self.observation_space, self.action_space)
-        if task is None:
-            vec_env.reset()
-            task = np.array(vec_env.get_attr("task")[0])
-        vec_env.set_options({"task_id": int(task)} if np.ndim(task) == 0 else {"task": np.asarray(task, dtype=np.float32)})
+        if vec_env.has_attr("task_family"):
+            if task is None:
+                vec_env.reset()
+                task = np.array(vec_env.get_attr("task")[0])
+            vec_env.set_options({"task_id": int(task)} if np.ndim(task) == 0 else {"task": np.asarray(task, dtype=np.float32)})
+        elif task is not None:
+            raise ValueError("The env has no task family, so it takes no task: leave task out, and set its task yourself.")
         adaptation = self.start_adaptation(1, explorer, th.Generator().manual_seed(seed))
-        record = run_adaptation(self.policy, vec_env, adaptation, n_episodes, deterministic)
+        returns, successes = np.zeros(n_episodes), np.zeros(n_episodes, dtype=bool)
+        act = partial(adaptation.act, deterministic=deterministic)
+        for step in adaptation_steps(vec_env, adaptation, n_episodes, self.policy.unscale_action, act):
+            episode = adaptation.n_episodes[0] - step.dones[0]
+            returns[episode] += step.rewards[0]
+            successes[episode] |= step.infos[0].get("is_success", adaptation.task_reward[0] > 0)
         if adaptation.best_return[0] <= 0:
             warnings.warn(
                 f"No reward was found in {n_episodes} episodes, so the agent is not adapted: allow more, or train longer.",
                 stacklevel=2,
             )
-        return AdaptedAgent(self.policy, adaptation.explorer.final_z()[0], record.returns[0], record.successes[0])
+        return AdaptedAgent(self.policy, adaptation.explorer.final_z()[0], returns, successes)
 
     def predict(
         self,
