@@ -33,6 +33,7 @@ from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.random_state import get_generator_state, get_global_state, set_generator_state, set_global_state
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
+from sb3_htr.pearl.horizon import complete, timesteps_for
 from sb3_htr.pearl.policies import PEARLPolicy
 
 SelfMetaAlgorithm = TypeVar("SelfMetaAlgorithm", bound="OffPolicyMetaAlgorithm")
@@ -46,12 +47,15 @@ class OffPolicyMetaAlgorithm(SAC):
 
     :param policy: name or class of the policy
     :param env: env of a task family (see ``htr_envs.TaskEnv``), VecEnv of such envs, or registered id
-    :param context_size: transitions per task for the context, at most
     :param n_tasks_per_rollout: training tasks per rollout
     :param n_episodes_per_task: episodes on each of them
+    :param learning_starts: env steps with random actions before learning starts
+    :param gradient_steps: updates after each rollout
+    :param batch_size: transitions per task for actor and critics, at most
+    :param context_size: transitions per task for the context, at most
+    :param gamma: discount. Which of these six are None follow from the time limit: :func:`sb3_htr.pearl.horizon.settings_for`
     :param explorer: chooses z at meta-test: an explorer, its name, or its name and settings
     :param train_explorer: the same for rollouts
-    :param learning_starts: env steps with random actions before learning starts
     :param replay_buffer_class: a MultiTaskReplayBuffer
     :param replay_buffer_kwargs: its arguments
     :param policy_kwargs: arguments of the policy
@@ -67,25 +71,22 @@ class OffPolicyMetaAlgorithm(SAC):
         policy: str | type[PEARLPolicy],
         env: GymEnv | str | None,
         *,
-        context_size: int,
         n_tasks_per_rollout: int,
-        n_episodes_per_task: int,
+        n_episodes_per_task: int | None,
+        learning_starts: int | None,
+        gradient_steps: int | None,
+        batch_size: int | None,
+        context_size: int | None,
+        gamma: float | None,
         explorer: Explorer | dict[str, Any] | str,
         train_explorer: Explorer | dict[str, Any] | str,
-        learning_starts: int,
         replay_buffer_class: type[MultiTaskReplayBuffer] | None,
         replay_buffer_kwargs: dict[str, Any] | None,
         policy_kwargs: dict[str, Any] | None,
         seed: int | None,
         **kwargs: Any,
     ) -> None:
-        infinity = float("inf")
-        checks.check_numbers(
-            context_size=(context_size, 1, infinity),
-            n_tasks_per_rollout=(n_tasks_per_rollout, 1, infinity),
-            n_episodes_per_task=(n_episodes_per_task, 1, infinity),
-            learning_starts=(learning_starts, 0, infinity),
-        )
+        checks.check_numbers(n_tasks_per_rollout=(n_tasks_per_rollout, 1, float("inf")))
         self.explorer, self.train_explorer = to_explorer(explorer), to_explorer(train_explorer)
         buffer_class = replay_buffer_class or MultiTaskReplayBuffer
         checks.check_keywords("replay_buffer_kwargs", replay_buffer_kwargs or {}, buffer_class)
@@ -94,10 +95,24 @@ class OffPolicyMetaAlgorithm(SAC):
         if env is not None:
             env = self._wrap_env(env)
             checks.check_spaces(env)
+        given = {
+            "gamma": gamma,
+            "n_episodes_per_task": n_episodes_per_task,
+            "learning_starts": learning_starts,
+            "gradient_steps": gradient_steps,
+            "batch_size": batch_size,
+            "context_size": context_size,
+        }
+        # Without an env, which is for files alone, the settings come from there
+        max_episode_steps = 1 if env is None else checks.get_max_episode_steps(env)
+        settings = complete(given, max_episode_steps, n_tasks_per_rollout)
         super().__init__(
             policy=policy,
             env=env,  # type: ignore[arg-type]
-            learning_starts=learning_starts,
+            gamma=settings["gamma"],
+            learning_starts=settings["learning_starts"],
+            gradient_steps=settings["gradient_steps"],
+            batch_size=settings["batch_size"],
             replay_buffer_class=buffer_class,
             replay_buffer_kwargs=replay_buffer_kwargs,
             policy_kwargs={} if policy_kwargs is None else dict(policy_kwargs),
@@ -108,9 +123,9 @@ class OffPolicyMetaAlgorithm(SAC):
         # SAC adds an argument for state-dependent exploration, which is not for us: z explores
         self.policy_kwargs.pop("use_sde")
         checks.check_keywords("policy_kwargs", self.policy_kwargs, self.policy_class)
-        self.context_size = context_size
+        self.context_size = settings["context_size"]
         self.n_tasks_per_rollout = n_tasks_per_rollout
-        self.n_episodes_per_task = n_episodes_per_task
+        self.n_episodes_per_task = settings["n_episodes_per_task"]
         self.task_bank: TaskBank | None = None
         #: Called after each update
         self.update_listeners: list[Callable[[], None]] = []
@@ -186,7 +201,7 @@ class OffPolicyMetaAlgorithm(SAC):
 
     def learn(
         self: SelfMetaAlgorithm,
-        total_timesteps: int = 150_000,
+        total_timesteps: int | None = None,
         callback: MaybeCallback = None,
         log_interval: int | None = 1,
         tb_log_name: str = "PEARL",
@@ -196,7 +211,8 @@ class OffPolicyMetaAlgorithm(SAC):
         """
         Meta-train.
 
-        :param total_timesteps: env steps; the last rollout is finished
+        :param total_timesteps: env steps; the last rollout is finished. By default, what follows from the time limit, see
+            :func:`sb3_htr.pearl.horizon.timesteps_for`
         :param callback: called at every step
         :param log_interval: rollouts between two logs, None for no logs
         :param tb_log_name: name of the run for TensorBoard
@@ -204,6 +220,9 @@ class OffPolicyMetaAlgorithm(SAC):
         :param progress_bar: show one
         :return: self
         """
+        if total_timesteps is None:
+            assert self.replay_buffer is not None
+            total_timesteps = timesteps_for(self.replay_buffer.max_episode_steps)
         return super().learn(
             total_timesteps=total_timesteps,
             callback=callback,
