@@ -304,7 +304,7 @@ def heights() -> Iterator[str]:
 
 def test_an_env_family(heights: str, tiny_pearl: MakePEARL) -> None:
     check_task_env(gym.make(heights))
-    model = tiny_pearl(heights, gradient_steps=20).learn(4 * 4 * 3 * 25)
+    model = tiny_pearl(heights, gradient_steps=60).learn(4 * 4 * 3 * 25)
     assert model.env is not None and isinstance(model.env.unwrapped, BatchedTaskVecEnv), "its batched env is used"
     buffer = model.replay_buffer
     assert buffer is not None and isinstance(buffer.task_family, Heights) and buffer.max_episode_steps == 25
