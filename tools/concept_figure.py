@@ -17,17 +17,22 @@ RADIUS = 0.2
 INK = "#222222"
 
 
-def goal(axes: plt.Axes, degrees: float, colour: str) -> np.ndarray:
-    """A goal on the semicircle. Its centre (2,)."""
-    centre = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
+def goal(axes: plt.Axes, degrees: float, colour: str) -> tuple[float, float]:
+    """A goal on the semicircle, and where its centre is."""
+    centre = on_circle(degrees)
     axes.add_patch(Circle(centre, RADIUS, facecolor=colour, alpha=0.35, edgecolor=colour))
     return centre
 
 
-def walk(end: np.ndarray, bend: float, n_steps: int = 8) -> np.ndarray:
+def on_circle(degrees: float, radius: float = 1.0) -> tuple[float, float]:
+    """A point as far from the start, in this direction."""
+    return radius * float(np.cos(np.radians(degrees))), radius * float(np.sin(np.radians(degrees)))
+
+
+def walk(end: tuple[float, float], bend: float, n_steps: int = 8) -> np.ndarray:
     """From the start to a point, not straight. Positions (n_steps + 1, 2)."""
     share = np.linspace(0, 1, n_steps + 1)[:, None]
-    return share * end + bend * np.sin(np.pi * share) * np.array([-end[1], end[0]])
+    return share * np.array(end) + bend * np.sin(np.pi * share) * np.array([-end[1], end[0]])
 
 
 def draw(axes: plt.Axes, path: np.ndarray, colour: str, width: float = 2.0) -> None:
@@ -57,8 +62,7 @@ def main() -> None:
         axes.set(xlim=(-1.5, 1.5), ylim=(-0.7, 1.34), aspect="equal")
         axes.axis("off")
     reached = 62.0
-    end = 1.04 * np.array([np.cos(np.radians(reached)), np.sin(np.radians(reached))])
-    path = walk(end, 0.18)
+    path = walk(on_circle(reached, 1.04), 0.18)
 
     x, y = goal(miss, 140, GREEN)
     draw(miss, path, GREY)
@@ -73,9 +77,8 @@ def main() -> None:
 
     hidden = goal(adapt, 105, GREEN)
     for number, (degrees, bend) in enumerate(((20.0, 0.1), (165.0, -0.1)), start=1):
-        tip = 1.05 * np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
-        draw(adapt, walk(tip, bend), GREY, 1.2)
-        label(adapt, *(1.12 * tip), str(number))
+        draw(adapt, walk(on_circle(degrees, 1.05), bend), GREY, 1.2)
+        label(adapt, *on_circle(degrees, 1.18), str(number))
     draw(adapt, walk(hidden, -0.08), BLUE)
     label(adapt, hidden[0], hidden[1] + 0.26, "3, 4, 5 ...")
     tried = "episodes 1, 2 search; episode 3 is rewarded"
