@@ -27,8 +27,11 @@ PAGES = [path for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.m
 @pytest.mark.filterwarnings("ignore:No reward was found")
 def test_the_code_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    # The README trains for minutes; here it is for a moment
-    code = python_blocks(page).replace("model.learn()", "model.learn(8000)")
+    # For a moment, where the page trains for seconds or minutes
+    code = python_blocks(page).replace("model.learn()", "model.learn(8000)").replace("gradient_steps=100", "gradient_steps=5")
+    code = code.replace(
+        'PEARL("MlpPolicy", "SparsePointRobot-v0"', 'PEARL("MlpPolicy", "SparsePointRobot-v0", gradient_steps=5'
+    )
     (tmp_path / "page.py").write_text(code)
     runpy.run_path("page.py", run_name="__main__")
 
