@@ -5,6 +5,7 @@ import runpy
 import shlex
 from pathlib import Path
 
+import agents_table
 import env_pages
 import pytest
 from tables import filled
@@ -53,6 +54,12 @@ def test_links_and_pictures_are_there() -> None:
 def test_pages_of_envs_say_what_the_docstrings_say(page: str) -> None:
     text = (env_pages.PAGES / f"{page}.md").read_text()
     assert text == filled(text, env_pages.tables(env_pages.ENVS[page])), "run python tools/env_pages.py"
+
+
+def test_the_table_of_agents_is_that_of_the_files() -> None:
+    text = (agents_table.AGENTS / "README.md").read_text()
+    scores = agents_table.read_scores()
+    assert text == filled(text, {"agents": agents_table.table(scores)}), "run python tools/agents_table.py"
 
 
 def test_the_tests_that_repeat_a_figure_are_there() -> None:
