@@ -65,8 +65,8 @@ def test_learn_changes_every_network(tiny_pearl: MakePEARL, kwargs: dict[str, An
 
 
 def test_the_actor_does_not_shape_z(tiny_pearl: MakePEARL) -> None:
-    """It sees z detached: where the critics do not ask for z and the KL term is off, the encoder has no gradient."""
-    model = tiny_pearl(kl_coef=0.0).learn(2 * ROLLOUT)
+    """It sees z detached: where neither critics nor reward model ask for it and the KL term is off, there is no gradient."""
+    model = tiny_pearl(kl_coef=0.0, reward_coef=0.0).learn(2 * ROLLOUT)
     obs_dim, latent_dim = 2, model.policy.latent_dim
     with th.no_grad():
         for network in (*model.critic.networks, *model.critic_target.networks):

@@ -20,12 +20,12 @@ def band(axes: plt.Axes, x: np.ndarray, scores: np.ndarray, colour: str, style: 
 
     :param axes: where
     :param x: (n,)
-    :param scores: (n_runs, n)
+    :param scores: (n_runs, n) or (n_runs, n_eval_seeds, n_tasks, n)
     :param colour: of line and band
     :param style: of the line, matplotlib's
     :param label: for the legend
     """
-    points = np.array([iqm_interval(column) for column in scores.T])
+    points = np.array([iqm_interval(scores[..., i]) for i in range(len(x))])
     axes.plot(x, points[:, 0], style, color=colour, label=label, marker="o" if len(x) <= MAX_MARKERS else "", markersize=4)
     axes.fill_between(x, points[:, 1], points[:, 2], color=colour, alpha=0.2, linewidth=0)
 
