@@ -108,8 +108,7 @@ gym.register("HiddenTargetReacher-v0", entry_point=HiddenTargetReacherEnv, max_e
 
 
 if __name__ == "__main__":
-    from sb3_htr import PEARL, evaluate_adaptation
-    from sb3_htr.common.vec_env import make_task_vec_env
+    from sb3_htr import PEARL, evaluate_adaptation, make_task_vec_env
 
     env = make_task_vec_env("HiddenTargetReacher-v0", n_envs=20, seed=0)
     # Velocities are large beside positions
