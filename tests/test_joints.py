@@ -22,10 +22,11 @@ from helpers.experience import by_task
 from helpers.runs import run_folder, train_arguments
 from htr_envs import Dynamics, DynamicsEnv, DynamicsVectorEnv, TaskFamily, at_step, check_reward_type, check_task_env
 from sb3_htr import PEARL, evaluate_adaptation
-from sb3_htr.adaptation import Explorer, Search, Step
+from sb3_htr.adaptation import Belief, Explorer, Step
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
 from sb3_htr.experiments import grid, report
 from sb3_htr.experiments.grid import Experiment, Variant
+from sb3_htr.experiments.runner import run_cells
 from sb3_htr.htr import Relabeller
 from sb3_htr.htr.relabel import RELABELLERS, HindsightDraw
 from sb3_htr.zoo.cli import main
@@ -301,13 +302,22 @@ def heights() -> Iterator[str]:
     del gym.registry["SparseHeights-v0"]
 
 
+# Enough for a family of one's own
+LEARNS: dict[str, Any] = {
+    "gradient_steps": 100,
+    "meta_batch_size": 32,
+    "batch_size": 16,
+    "policy_kwargs": {"net_arch": [64, 64], "encoder_arch": [64, 64], "latent_dim": 3},
+}
+
+
 def test_an_env_family(heights: str, tiny_pearl: MakePEARL) -> None:
     check_task_env(gym.make(heights))
-    model = tiny_pearl(heights, gradient_steps=20).learn(4 * 4 * 3 * 25)
+    model = tiny_pearl(heights, seed=1, **LEARNS).learn(8 * 4 * 3 * 25)
     assert model.env is not None and isinstance(model.env.unwrapped, BatchedTaskVecEnv), "its batched env is used"
     buffer = model.replay_buffer
     assert buffer is not None and isinstance(buffer.task_family, Heights) and buffer.max_episode_steps == 25
-    assert model.task_bank is not None and len(model.task_bank.solved) > 10, "random flights, rewarded in hindsight"
+    assert model.task_bank is not None and int(model.knowledge.n_particles) > 10, "random flights, rewarded in hindsight"
     data = buffer.sample(16, meta_batch_size=100)
     assert data.rewards.min() < 0 and (~data.unrewarded[data.relabelled]).mean() > (~data.unrewarded[~data.relabelled]).mean()
     returns, successes = evaluate_adaptation(model, heights, n_episodes=6)
@@ -328,17 +338,17 @@ def test_an_experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     drawn: list[str] = []
     tiny = {**yaml.safe_load("{n_envs: 4, learning_starts: 240}"), **{key: TINY[key] for key in TINY if key != "seed"}}
-    row = Variant("htr-ser", "sharp", {**tiny, "explorer": {"scale": 0.7}})
-    experiment = Experiment("A toy.", ENV_ID, 960, (row,), 1, 480, explorers=("aggregate",), figure=figure)
-    monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 50)
+    row = Variant("htr-ser", "sharp", {**tiny, "explorer": {"margin": 0.7}})
+    experiment = Experiment("toy", "A toy.", ENV_ID, 960, (row,), 1, 480, explorers=("aggregate",), figure=figure)
+    monkeypatch.setattr("sb3_htr.experiments.protocol.EVAL_SEEDS", (1,))
     monkeypatch.setitem(grid.EXPERIMENTS, "toy", experiment)
     runs, results = tmp_path / "runs", tmp_path / "results"
-    report.run("toy", "python toy.py", experiment, experiment.cells(), runs, results, 1)
+    report.write("python toy.py", experiment, run_cells(experiment.cells(), runs, 1), results)
     assert drawn == ["sharp"] and (results / "toy.png").exists()
     summary = json.loads((results / "summary.json").read_text())
     assert [row["variant"] for row in summary["rows"] if row["metric"] == "success_rate"] == drawn
-    agent = agent_at(runs / experiment.cells()[0].name)
-    assert agent.method == "htr-ser" and agent.load().explorer == Search(scale=0.7)
+    agent = agent_at(experiment.cells()[0].run_folder(runs))
+    assert agent.method == "htr-ser" and agent.load().explorer == Belief(margin=0.7)
 
 
 # --- a method
@@ -350,7 +360,7 @@ half-half:
   relabeller: 'EpisodeClustering'
   relabel_probability: 0.5
   rl_reward_type: 'dense'
-  train_explorer: 'search'
+  train_explorer: 'belief'
   explorer: 'aggregate'
 """
 
@@ -365,7 +375,7 @@ def test_a_method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
         run = run_folder(tmp_path, "half-half")
         model = agent_at(run, "last").load(trust=True)
         assert json.loads((run / RECORD).read_text())["method"] == "half-half"
-        assert (model.explorer.name, model.train_explorer.name) == ("aggregate", "search")
+        assert (model.explorer.name, model.train_explorer.name) == ("aggregate", "belief")
         buffer: Any = model.replay_buffer_kwargs
         assert (buffer["relabel_probability"], buffer["rl_reward_type"]) == (0.5, "dense")
         assert buffer["relabeller"]["name"] == "EpisodeClustering"

@@ -8,11 +8,9 @@ import torch as th
 from sb3_htr.adaptation.explorers import Explorer
 from sb3_htr.adaptation.knowledge import LatentKnowledge
 from sb3_htr.adaptation.policy import ContextualPolicy
+from sb3_htr.common.task_reward import task_reward
 from sb3_htr.common.type_aliases import Context
 from sb3_htr.htr.episode_store import evenly_spread
-
-# A return without its task-free part is that much above 0, or it is 0: the difference of two sums of float32
-ROUNDING = 1e-5
 
 
 class Step(NamedTuple):
@@ -123,9 +121,7 @@ class Adaptation:
 
     @staticmethod
     def _told(step: Step) -> np.ndarray:
-        beside = step.rewards - np.array([info.get("task_free_reward", 0.0) for info in step.infos])
-        # 0 or clearly more: the difference of two float32
-        return np.where(beside > ROUNDING, beside, 0.0)
+        return task_reward(step.rewards, np.array([info.get("task_free_reward", 0.0) for info in step.infos]))
 
     def _learned(self, step: Step) -> np.ndarray:
         policy, device = self.policy, self.policy.device

@@ -13,6 +13,8 @@ from sb3_htr.common.type_aliases import Context
 # Quantiles of what unrewarded and rewarded steps return beside what the model says is task-free; rewards are told from the
 # model's errors by the middle between the two
 UNREWARDED, REWARDED = 0.999, 0.001
+# Networks see the tasks of a bank as so many, or twice as many, and so on: of each new shape, oneDNN keeps something for good
+BLOCK = 64
 
 
 class Particles(NamedTuple):
@@ -47,6 +49,7 @@ class LatentKnowledge(nn.Module):
     mean: th.Tensor
     cholesky: th.Tensor
     threshold: th.Tensor
+    task_free_value: th.Tensor
     n_particles: th.Tensor
     z: th.Tensor
     gain: th.Tensor
@@ -62,22 +65,25 @@ class LatentKnowledge(nn.Module):
         self.register_buffer("cholesky", th.eye(latent_dim))
         # Above it, what a step returned beside the task-free part is a reward of the task
         self.register_buffer("threshold", th.tensor(0.5))
+        # Discounted sum of what unrewarded steps return, forever
+        self.register_buffer("task_free_value", th.zeros(()))
         self.register_buffer("n_particles", th.zeros((), dtype=th.int64))
         for name, shape in (("z", (n, latent_dim)), ("gain", (n, n)), ("returns", (n, n)), ("log_prior", (n,))):
             self.register_buffer(name, th.zeros(shape))
         self.register_buffer("is_train", th.zeros(n, dtype=th.bool))
 
-    def learn(self, policy: ContextualPolicy, means: th.Tensor, bank: TaskBank) -> None:
+    def learn(self, policy: ContextualPolicy, means: th.Tensor, bank: TaskBank, gamma: float) -> None:
         """
         :param policy: networks as they are now
         :param means: (n, latent_dim), posterior means of recent meta-batches
         :param bank: tasks that were solved
+        :param gamma: discount
         """
         self.set_aggregate(means)
         # A loaded model's particles are kept until this training knows as many
-        if int((bank.length > 0).sum()) >= max(int(self.n_particles), 1):
+        if bank.n_solved >= max(int(self.n_particles), 1):
             with th.no_grad():
-                self._set_particles(policy, bank)
+                self.set_particles(self._solved(policy, bank, gamma))
 
     def set_aggregate(self, means: th.Tensor) -> None:
         """
@@ -100,8 +106,9 @@ class LatentKnowledge(nn.Module):
         noise = th.randn(n, self.latent_dim, generator=generator).to(self.mean.device)
         return np.asarray((self.mean + scale * noise @ self.cholesky.T).cpu().numpy())
 
-    def _set_particles(self, policy: ContextualPolicy, bank: TaskBank) -> None:
-        solved, columns, model = bank.solved(), bank.transitions, policy.reward_model
+    def _solved(self, policy: ContextualPolicy, bank: TaskBank, gamma: float) -> Particles:
+        """A particle for each solved task; sets beside them what tells rewards from what is task-free."""
+        solved, columns, model = bank.solved(multiple=BLOCK), bank.transitions, policy.reward_model
         data = th.as_tensor(solved.rows, device=policy.device)
         lengths = th.as_tensor(solved.lengths, device=policy.device)
         action, reward = data[:, columns.action], data[:, columns.reward]
@@ -111,24 +118,31 @@ class LatentKnowledge(nn.Module):
         obs, next_obs = (policy.normalize(data[:, column]) for column in (columns.observation, columns.next_observation))
         # Of the steps that are rewarded: chance of a reward, and reward to be expected, under each task
         success = th.as_tensor(solved.success, device=policy.device)
-        episode = th.repeat_interleave(th.arange(len(z), device=z.device), lengths)[success]
-        states, tasks = model.state_tower(next_obs[success]), model.task_tower(z)
-        chance = model.success_logits(states, tasks).sigmoid()
+        episode = th.repeat_interleave(th.arange(len(z), device=z.device), lengths)
+        states, tasks = model.state_tower(next_obs), model.task_tower(z)
+        chance = model.success_logits(states, tasks).sigmoid() * success[:, None]
         expected = chance * model.success_rewards(states, tasks).clamp(min=0)
-        n_rewarded = th.zeros_like(z[:, 0]).index_add(0, episode, th.ones_like(episode, dtype=z.dtype)).clamp(min=1)[:, None]
+        n_rewarded = th.zeros_like(z[:, 0]).index_add(0, episode, success.to(z.dtype)).clamp(min=1)[:, None]
+        n = bank.n_solved
         overlap, earned = (th.zeros(len(z), len(z), device=z.device).index_add(0, episode, x) for x in (chance, expected))
-        overlap = overlap / n_rewarded
-        share = (earned / earned.diag().clamp(min=1e-6)[:, None]).clamp(0, 1.2)
-        is_train = th.as_tensor(solved.is_train, device=z.device)
-        returns = th.as_tensor(solved.returns, device=z.device)
-        particles = Particles(z, earned / n_rewarded, share * returns[:, None], _log_prior(z, overlap, is_train), is_train)
-        n = len(z)
-        self.z[:n], self.gain[:n, :n], self.returns[:n, :n], self.log_prior[:n], self.is_train[:n] = particles
-        self.n_particles.fill_(n)
-        beside = reward - model.task_free(obs, action, next_obs)
+        z, n_rewarded, overlap, earned = z[:n], n_rewarded[:n], overlap[:n, :n] / n_rewarded[:n], earned[:n, :n]
+        share = (earned / earned.diag().clamp(min=1e-6)[:, None]).clamp(0, 1.2).fill_diagonal_(1)
+        is_train, returns = (th.as_tensor(x[:n], device=z.device) for x in (solved.is_train, solved.returns))
+        task_free = model.task_free(obs, action, next_obs)
+        self.task_free_value.copy_(task_free.mean() / max(1 - gamma, 1e-3))
+        beside = reward - task_free
         unrewarded = beside[~success].quantile(UNREWARDED) if (~success).any() else th.zeros(())
         rewarded = beside[success].quantile(REWARDED)
         self.threshold.copy_((unrewarded + rewarded) / 2)
+        return Particles(z, earned / n_rewarded, share * returns[:, None], _log_prior(z, overlap, is_train), is_train)
+
+    def set_particles(self, particles: Particles) -> None:
+        """
+        :param particles: in place of those that were there
+        """
+        n = len(particles.z)
+        self.z[:n], self.gain[:n, :n], self.returns[:n, :n], self.log_prior[:n], self.is_train[:n] = particles
+        self.n_particles.fill_(n)
 
     def particles(self) -> Particles:
         """

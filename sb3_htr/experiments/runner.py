@@ -4,111 +4,86 @@ import json
 import os
 import subprocess
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import htr_envs  # noqa: F401 registers the envs
-from sb3_htr.adaptation.evaluation import evaluate_adaptation
+from sb3_htr import PEARL
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.resume import checkpoints
-from sb3_htr.zoo.run.agents import RECORD, agent_at, find_run, read_record
+from sb3_htr.experiments.cell import Cell
+from sb3_htr.experiments.protocol import evaluate, last_episode_return
+from sb3_htr.zoo.run.agents import RECORD, agent_at, file_stem, find_runs, read_record
 
 # Means over the training of what HTR paper, B.2 reasons with
 LOGGED = ("relabelled_fraction", "rl_reward_mean", "rl_zero_reward_fraction")
 
 
-@dataclass(frozen=True, eq=False)
-class Cell:
+def run_cell(cell: Cell, runs: Path) -> Path:
     """
-    One training run.
-
-    :param env_id: registered env
-    :param method: name in hyperparams/methods.yml
-    :param variant: name in tables and folders
-    :param seed: seed of the run
-    :param n_timesteps: budget of env steps
-    :param eval_freq: env steps between evaluations on the validation tasks
-    :param settings: hyperparameters, joined with those of env and method
-    :param env_kwargs: arguments of the env
-    :param explorers: how the final model explores on the test tasks; one row of results for each
-    """
-
-    env_id: str
-    method: str
-    variant: str
-    seed: int
-    n_timesteps: int
-    eval_freq: int
-    settings: dict[str, Any]
-    env_kwargs: dict[str, Any]
-    explorers: tuple[str, ...]
-
-    @property
-    def name(self) -> str:
-        """Folder of the run."""
-        kwargs = "".join(f"-{key}{value}" for key, value in self.env_kwargs.items())
-        return f"{self.variant}{kwargs}-seed{self.seed}".replace(" ", "")
-
-    def command(self, folder: Path) -> list[str]:
-        """
-        :param folder: log folder
-        :return: command line of the training
-        """
-        settings = [f"{key}:{value!r}" for key, value in self.settings.items()]
-        kwargs = [f"{key}:{value!r}" for key, value in self.env_kwargs.items()]
-        return [
-            *(sys.executable, "-m", "sb3_htr.zoo.cli", "train", "--env", self.env_id, "--method", self.method),
-            *("-f", str(folder), "--verbose", "0", "-n", str(self.n_timesteps)),
-            *("--seed", str(self.seed), "--eval-freq", str(self.eval_freq)),
-            *(["-params", *settings] if settings else []),
-            *(["--env-kwargs", *kwargs] if kwargs else []),
-        ]
-
-
-def run_cell(cell: Cell, folder: Path) -> Path:
-    """
-    Train, then adapt the final model to the test tasks.
+    Train, unless there is a finished run, then test the final model.
 
     :param cell: what to run
-    :param folder: where all cells' folders are; a cell that has a result there is not run again
-    :return: npz with ``timesteps``, ``curve`` (n, n_tasks) on validation tasks, and for each explorer
-        ``returns_<explorer>`` and ``successes_<explorer>`` (n_tasks, n_episodes) on test tasks; the means of what is in
-        ``LOGGED``; ``wall_s`` of the training and ``commit`` of the code
+    :param runs: folder of all experiments' runs; a cell that has a result there is not run again
+    :return: npz with ``timesteps``, ``curve`` (n, n_tasks) on validation tasks; what
+        :func:`sb3_htr.experiments.protocol.evaluate` tells of the final model; the means of what is in ``LOGGED``;
+        ``wall_s`` of the training and ``commit`` of the code that trained
+    :raises ValueError: if the run in the cell's folder is another one
     """
-    result = folder / f"{cell.name}.npz"
+    result, folder = cell.result(runs), cell.run_folder(runs)
     if result.exists():
         return result
-    start = time.monotonic()
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    (folder / cell.name).mkdir(parents=True, exist_ok=True)
-    command = _resume(folder / cell.name) or cell.command(folder / cell.name)
-    with open(folder / cell.name / "log.txt", "a") as log:
-        subprocess.run(command, check=True, stdout=log, stderr=log, env=environment)
-    wall = time.monotonic() - start
-    run = find_run(folder / cell.name)
-    agent = agent_at(run, "last")
-    model, env = agent.load(), agent.make_vec_env(20)
+    folder.mkdir(parents=True, exist_ok=True)
+    trained = find_finished(cell, folder)
+    if trained is None:
+        with open(folder / "log.txt", "a") as log:
+            environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+            subprocess.run(_resume(folder) or cell.training(folder), check=True, stdout=log, stderr=log, env=environment)
+        trained = find_finished(cell, folder)
+        if trained is None:
+            raise RuntimeError(f"The training in {folder} ended before its {cell.n_timesteps:,} env steps: see its log.txt.")
+    run, model = trained
     evaluations = np.load(run / "evaluations.npz")
     progress = np.genfromtxt(run / "progress.csv", delimiter=",", names=True, deletechars="")
     arrays: dict[str, Any] = {
         **{key: np.nanmean(progress[f"train/{key}"]) for key in LOGGED},
         "timesteps": evaluations["timesteps"],
         "curve": evaluations["results"],
-        "wall_s": wall,
+        "wall_s": _wall_time(progress["time/time_elapsed"]),
         "commit": _commit_of(run),
+        **evaluate(cell, model),
     }
-    for explorer in cell.explorers:
-        returns, successes = evaluate_adaptation(model, env, explorer=explorer)
-        arrays |= {f"returns_{explorer}": returns.astype(np.float32), f"successes_{explorer}": successes}
     with atomic_path(result) as path:
         np.savez_compressed(path, **arrays)
-    print(f"{cell.name}: {json.dumps({e: round(float(arrays[f'returns_{e}'][:, -1].mean()), 2) for e in cell.explorers})}")
+    scores = {explorer: round(float(last_episode_return(arrays, explorer).mean()), 2) for explorer in cell.explorers}
+    print(f"{cell.experiment}/{cell.name}: {json.dumps(scores)}")
     return result
+
+
+def find_finished(cell: Cell, folder: Path) -> tuple[Path, PEARL] | None:
+    """
+    :param cell: what was to be trained
+    :param folder: log folder
+    :return: the run folder and its final model, None if there is no run, or none that is finished
+    :raises ValueError: if a run in the folder is another one
+    """
+    for run in find_runs(folder) if any(folder.rglob(RECORD)) else ():
+        record = read_record(run / RECORD)
+        for key in ("env_id", "env_kwargs", "method", "seed", "n_timesteps"):
+            if record[key] != getattr(cell, key):
+                raise ValueError(
+                    f"{run} has {key} {record[key]!r}, but {cell.experiment}/{cell.name} needs {getattr(cell, key)!r}: "
+                    f"move this run away, or choose other --runs."
+                )
+        # An interrupted training leaves a model, too
+        if (run / f"{file_stem(cell.env_id)}.zip").exists():
+            model = agent_at(run, "last").load()
+            if model.num_timesteps >= cell.n_timesteps:
+                return run, model
+    return None
 
 
 def _resume(folder: Path) -> list[str] | None:
@@ -117,19 +92,25 @@ def _resume(folder: Path) -> list[str] | None:
     return [sys.executable, "-m", "sb3_htr.zoo.cli", "train", "--resume", str(unfinished[-1])] if unfinished else None
 
 
+def _wall_time(elapsed: np.ndarray) -> float:
+    """Seconds, from those since the training began or went on (n,)."""
+    elapsed = elapsed[~np.isnan(elapsed)]
+    return float(elapsed[np.append(np.diff(elapsed) < 0, True)].sum())
+
+
 def _commit_of(run: Path) -> str:
     """Of the code that trained, as it was when the training began."""
     record = read_record(run / RECORD)
     return f"{record.get('commit', 'unknown')}{'' if record.get('clean', True) else ' with changes'}"
 
 
-def run_cells(cells: list[Cell], folder: Path, jobs: int) -> dict[Cell, Path]:
+def run_cells(cells: list[Cell], runs: Path, jobs: int) -> dict[Cell, Path]:
     """
     :param cells: runs of the experiment
-    :param folder: where runs and results go
+    :param runs: folder of all experiments' runs
     :param jobs: number of runs at a time, each on one thread
     :return: the result file of each cell
     """
     with ThreadPoolExecutor(jobs) as pool:
-        paths = list(pool.map(lambda cell: run_cell(cell, folder), cells))
+        paths = list(pool.map(lambda cell: run_cell(cell, runs), cells))
     return dict(zip(cells, paths, strict=True))

@@ -12,6 +12,7 @@ from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from sb3_htr.common.checks import check_numbers, check_same_family, family_facts
 from sb3_htr.common.random_state import get_generator_state, set_generator_state
 from sb3_htr.common.settings import make
+from sb3_htr.common.task_reward import task_reward
 from sb3_htr.common.type_aliases import Context, MultiTaskSamples, RewardLabels, TaskFamily
 from sb3_htr.htr.episode_store import EpisodeStore
 from sb3_htr.htr.relabel import RELABELLERS, Relabeller
@@ -291,8 +292,9 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         """
         Draw a meta-batch: tasks with replacement (as PEARL's reference does), and for each of them context and RL batch.
 
-        No transition is drawn twice: where the episodes that a task's context or RL batch comes from hold fewer than asked
-        for, it is all of them. A loss that weighs tasks equally has the same expectation as with duplicates, for less work.
+        Where the episodes that a task's context or RL batch comes from hold fewer transitions than asked for, it is all of
+        them, and none is drawn twice (but for the share that a relabeller draws from anywhere). A loss that weighs tasks
+        equally has the same expectation as with duplicates, for less work.
 
         :param batch_size: transitions per task for actor and critics, at most
         :param meta_batch_size: number of tasks, M
@@ -364,10 +366,10 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         columns = self.transitions
         chosen = self._rng.permutation(len(rows))[:n_labelled]
         traj = columns.trajectory(rows[chosen])
-        reward = self.task_family.compute_reward(traj, tasks) - traj.task_free_reward
+        reward = task_reward(self.task_family.compute_reward(traj, tasks), traj.task_free_reward)
         rewarded = context[:, columns.reward] != context[:, columns.task_free_reward]
         inferred = np.logical_or.reduceat(rewarded, np.cumsum(n_context) - n_context)
-        labels = (chosen, self.task_family.is_success(traj, tasks).T, reward.T, traj.task_free_reward, inferred)
+        labels = (chosen, reward.T > 0, reward.T, traj.task_free_reward, inferred)
         dtypes = (np.int64, *[np.float32] * 4)
         return RewardLabels(*(self.to_torch(x.astype(dtype)) for x, dtype in zip(labels, dtypes, strict=True)))
 

@@ -8,17 +8,16 @@ import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
 
-from helpers import MakePEARL
-from helpers.adaptations import begin, know_tasks, play, step
-from sb3_htr.adaptation import Aggregate, Search
-from sb3_htr.adaptation.explorers.task_belief import TaskBelief
-from sb3_htr.adaptation.knowledge import KnownTasks
+from helpers import ENV_ID, MakePEARL
+from helpers.adaptations import begin, know_tasks, play, step, walk
+from sb3_htr import PEARL
+from sb3_htr.adaptation import Aggregate, Belief, LearnedPrior
 from sb3_htr.common.type_aliases import Context
 
-SETBACKS = Search().max_setbacks
+SETBACKS = Aggregate().max_setbacks
 
 
-@pytest.mark.parametrize("explorer", ["prior", "aggregate", "search"])
+@pytest.mark.parametrize("explorer", ["prior", "aggregate", "belief", "learned-prior"])
 def test_the_given_explorer_is_settings_and_each_adaptation_has_its_own(tiny_pearl: MakePEARL, explorer: str) -> None:
     """Two adaptations at once, of one object, do not meet."""
     model = tiny_pearl(explorer=explorer)
@@ -29,6 +28,18 @@ def test_the_given_explorer_is_settings_and_each_adaptation_has_its_own(tiny_pea
     play(other, [[5, 5], [1, 0]])
     np.testing.assert_array_equal(play(ours, [[0, 0], [0, 5], [0, 4], [3, 4]]), alone)
     assert ours.explorer is not model.explorer is not other.explorer and vars(model.explorer) == before
+
+
+@pytest.fixture(scope="module")
+def known() -> Any:
+    """Models that know so many tasks, made once."""
+    model = PEARL("MlpPolicy", ENV_ID, policy_kwargs={"latent_dim": 3, "net_arch": [16]}, seed=0)
+
+    def with_tasks(n: int) -> PEARL:
+        know_tasks(model, n)
+        return model
+
+    return with_tasks
 
 
 # --- prior
@@ -83,62 +94,14 @@ def test_a_long_episode_narrows_the_posterior_as_much_as_a_context_of_training(t
     np.testing.assert_allclose(adaptation.posterior()[1], variance.sqrt(), rtol=1e-5)
 
 
-# --- search
-
-
-def test_search_tries_every_known_task_once_until_a_reward(tiny_pearl: MakePEARL) -> None:
+@pytest.mark.parametrize("max_setbacks", [2, 4])
+def test_it_settles_on_the_best_episode_after_setbacks(tiny_pearl: MakePEARL, max_setbacks: int) -> None:
     model = tiny_pearl()
-    z_known = know_tasks(model)
-    z = np.stack(play(begin(model, "search", 2), [[0, 0], [0, 5], [0, 4], [0, 4]])[:4])
-    assert sorted(map(tuple, z[:, 0])) == sorted(map(tuple, z_known)), "the first env has seen no reward"
-    visited = (z[:, 1, None] == z_known).all(axis=2).any(axis=1)
-    assert visited[:2].all()
-    # The reward was that of the task visited, so the best guess is another one, and then it is the posterior's turn
-    assert not visited[3], "after a reward and a setback, the posterior is used"
-
-
-def test_a_visit_that_fails_turns_to_another_within_the_episode(tiny_pearl: MakePEARL) -> None:
-    model = tiny_pearl()
-    z_known = know_tasks(model, n=8, first_success=3)
-    adaptation = begin(model, "search")
-    first = adaptation.z.copy()
-    nothing, reward = (step(np.zeros((1, 2)), [value], False) for value in (0.0, 1.0))
-    seen = []
-    for _ in range(10):
-        adaptation.observe(nothing)
-        seen.append(adaptation.z.copy())
-    assert (seen[3] == first).all(), "the visit has its time, and a fifth more, and a step"
-    assert (seen[4] != first).any()
-    assert (seen[4] == z_known).all(axis=1).any()
-    assert len(np.unique(np.concatenate(seen), axis=0)) == 3
-    # A reward is a reason to stay
-    adaptation.observe(reward)
-    stay = adaptation.z.copy()
-    for _ in range(10):
-        adaptation.observe(nothing)
-        assert (adaptation.z == stay).all()
-
-
-def test_an_episode_of_several_visits_is_no_success_to_settle_on(tiny_pearl: MakePEARL) -> None:
-    """Acting with its last z from the start may find nothing."""
-    model = tiny_pearl()
-    know_tasks(model, n=8, first_success=1)
-    adaptation = begin(model, "search")
-    for i in range(6):
-        adaptation.observe(step(np.zeros((1, 2)), [9.0 * (i == 5)], i == 5))
-    assert not adaptation.explorer.exploring()[0]
-    z = play(adaptation, [[1.0], [0.0]])
-    np.testing.assert_array_equal(adaptation.explorer.final_z(), z[0])
-
-
-@pytest.mark.parametrize("explorer", [Search(), Search(max_setbacks=2), Aggregate()])
-def test_it_settles_on_the_best_episode_after_setbacks(tiny_pearl: MakePEARL, explorer: Aggregate) -> None:
-    model, n = tiny_pearl(), explorer.max_setbacks
-    know_tasks(model, n=12)
-    z = play(begin(model, explorer), [[0.0], [5.0], *[[1.0] for _ in range(n)], [5.0], [5.0]])
-    for episode in range(2, 2 + n):
+    explorer = Aggregate(max_setbacks=max_setbacks)
+    z = play(begin(model, explorer), [[0.0], [5.0], *[[1.0] for _ in range(max_setbacks)], [5.0], [5.0]])
+    for episode in range(2, 2 + max_setbacks):
         assert (z[episode] != z[1]).any()
-    for settled in z[2 + n :]:
+    for settled in z[2 + max_setbacks :]:
         np.testing.assert_array_equal(settled, z[1])
 
 
@@ -146,96 +109,165 @@ def test_it_settles_on_the_best_episode_after_setbacks(tiny_pearl: MakePEARL, ex
 def test_an_episode_that_is_a_little_better_is_no_reason_to_search_on(
     tiny_pearl: MakePEARL, clearly_better: float, settles: bool
 ) -> None:
-    model = tiny_pearl()
-    know_tasks(model, n=12)
-    explorer = Search(clearly_better=clearly_better)
-    z = play(begin(model, explorer), [[5.0 + 0.01 * i] for i in range(SETBACKS + 3)])
+    explorer = Aggregate(clearly_better=clearly_better)
+    z = play(begin(tiny_pearl(), explorer), [[5.0 + 0.01 * i] for i in range(SETBACKS + 3)])
     # It settles on the best of them
     for later in (1, 2):
         assert (z[SETBACKS + later] == z[SETBACKS]).all() == settles
 
 
-def test_the_posterior_of_search_sees_the_best_episode_only(tiny_pearl: MakePEARL) -> None:
+def test_the_posterior_of_aggregate_sees_the_best_episode_only(tiny_pearl: MakePEARL) -> None:
     """The misses before it, whatever they were, make no difference."""
     model = tiny_pearl()
     ends = []
     for length_of_miss in (2, 7):
-        # Without known tasks, only the posterior is used
-        adaptation = begin(model, "search")
+        adaptation = begin(model, "aggregate")
         play(adaptation, [[0]], length_of_miss)
         adaptation.generator = th.Generator().manual_seed(1)
         ends.append(play(adaptation, [[1]])[-1])
     np.testing.assert_allclose(ends[0], ends[1], rtol=1e-5)
 
 
-def test_the_frozen_agent_acts_with_what_is_known_to_work(tiny_pearl: MakePEARL) -> None:
+# --- belief
+
+
+@given(
+    rewards=st.lists(st.sampled_from([0.0, 0.4, 1.0, 5.0, 5.5, 90.0]), min_size=1, max_size=30),
+    n=st.integers(1, 6),
+    doubt=st.sampled_from([1e-6, 0.02, 0.5]),
+    temperature=st.sampled_from([0.0, 0.5, 1.0]),
+    noise=st.sampled_from([0.0, 0.1]),
+)
+def test_the_belief_follows_bayes_rule(
+    known: Any, rewards: list[float], n: int, doubt: float, temperature: float, noise: float
+) -> None:
+    """Step by step, with its formula written down once more."""
+    model = known(n)
+    settings = {"doubt": doubt, "temperature": temperature, "noise": noise}
+    adaptation = begin(model, {"name": "learned-prior", **settings})
+    explorer = adaptation.explorer
+    assert isinstance(explorer, LearnedPrior)
+    deviation = max(model.policy.reward_model.deviation.item(), noise * 5.0)
+    expected = np.zeros(n)
+    for i, reward in enumerate(rewards):
+        place = i % (n + 1)
+        adaptation.observe(step([[place, 0.0]], [reward], i % 4 == 3))
+        chance = np.clip(1 / (1 + np.exp(-(20.0 - 40.0 * np.abs(place - np.arange(n))))), doubt, 1 - doubt)
+        counts = reward > 0.5
+        surprise = 0.5 * np.clip((reward - 5.0) / deviation, -3, 3) ** 2
+        expected += temperature * ((np.log(chance) - surprise) if counts else np.log(1 - chance))
+    weights = explorer.weights(np.arange(1))[0].numpy()
+    assert np.isfinite(weights).all() and weights.sum() == pytest.approx(1, abs=1e-5)
+    likelihood = np.exp(expected - expected.max())
+    np.testing.assert_allclose(weights, likelihood / likelihood.sum(), atol=1e-3)
+
+
+def test_it_goes_where_a_reward_may_still_be_and_stays_where_one_was(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    know_tasks(model, 9)
+    task = np.arange(9.0)
+    places, rewards = walk(begin(model, "belief", 9), task, n_episodes=10, length=6)
+    first = (rewards.reshape(9, -1) > 0).argmax(axis=1)
+    assert (rewards.reshape(9, -1) > 0).any(axis=1).all() and first.max() < 20, "no place is visited in vain for long"
+    visited = np.diff(places.reshape(9, -1), axis=1) != 0
+    assert visited[:, :5].any(), "it turns elsewhere within an episode"
+    assert (rewards[:, -3:] == 5.0).all() and (np.ptp(places[:, -3:], axis=(1, 2)) == 0).all()
+
+
+def test_what_was_learnt_in_one_env_stays_there(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    know_tasks(model, 5)
+    both = walk(begin(model, "belief", 2), np.array([3.0, 1.0]), 4)
+    alone = walk(begin(model, "belief", 1), np.array([3.0]), 4)
+    np.testing.assert_array_equal(both[0][:1], alone[0])
+
+
+def test_it_repeats_the_best_episode_unless_another_task_promises_more(tiny_pearl: MakePEARL) -> None:
+    """Particle 1 is said to return 20 under task 0, and does not."""
+    model = tiny_pearl()
+    z = know_tasks(model, 3)
+    model.knowledge.returns[1, 0] = 20.0
+    adaptation = begin(model, "belief")
+    places, rewards = walk(adaptation, np.array([0.0]), n_episodes=6)
+    found = int((rewards[0].sum(axis=1) > 0).argmax())
+    assert 1.0 in places[0, found + 1 :], "the one that promises more is tried"
+    assert (places[0, -1] == 0).all() and rewards[0, -1].sum() > 0, "and then no more"
+    np.testing.assert_array_equal(adaptation.explorer.final_z(), z[:1])
+
+
+def test_an_episode_of_several_z_is_none_to_repeat(tiny_pearl: MakePEARL) -> None:
+    """Acting with its last z from the start may find nothing."""
+    model = tiny_pearl()
+    know_tasks(model, 8)
+    adaptation = begin(model, "belief")
+    for i in range(6):
+        adaptation.explorer.look(np.zeros((1, 2), dtype=np.float32))
+        place = adaptation.z[0, 0]
+        adaptation.observe(step([[place, 0.0]], [9.0 * (i == 5)], i == 5))
+    explorer = adaptation.explorer
+    assert isinstance(explorer, Belief) and not explorer.exploring()[0] and explorer._best_z_return[0] == 0
+    z = play(adaptation, [[1.0], [0.0]])
+    np.testing.assert_array_equal(explorer.final_z(), z[0])
+
+
+def test_the_posterior_of_a_better_episode_is_tried_once(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    know_tasks(model, 3)
+    adaptation = begin(model, "belief")
+    z = play(adaptation, [[5.0], [1.0], [1.0]])
+    mean, _ = adaptation.posterior()
+    np.testing.assert_array_equal(z[1], mean)
+    assert (z[2] != mean).any() and (z[3] != mean).any()
+
+
+@pytest.mark.parametrize("explorer", ["belief", "aggregate", "prior", "learned-prior"])
+def test_nothing_but_observations_actions_and_rewards_is_used(tiny_pearl: MakePEARL, explorer: str) -> None:
+    """What infos say makes no difference, and neither does whether they say anything."""
     model = tiny_pearl()
     know_tasks(model)
-    adaptation = begin(model, "search", 2)
-    z = play(adaptation, [[0.0, 0.0], [5.0, 0.0], [1.0, 0.0]])
-    final = adaptation.explorer.final_z()
-    np.testing.assert_array_equal(final[0], z[1][0])
-    np.testing.assert_array_equal(final[1], adaptation.z[1])  # nothing is known to work
+    ends = []
+    lies: list[dict[str, Any]] = [{}, {"task_free_reward": 5.0, "is_success": True, "task_id": 7}]
+    for info in lies:
+        adaptation = begin(model, explorer)
+        for i in range(12):
+            adaptation.explorer.look(np.zeros((1, 2), dtype=np.float32))
+            given = step([[0.1 * i, 0.0]], [5.0 * (i == 4)], i % 3 == 2)
+            adaptation.observe(given._replace(infos=[info]))
+        ends.append(adaptation.z.copy())
+    np.testing.assert_array_equal(ends[0], ends[1])
+
+
+@pytest.mark.parametrize("explorer", ["belief", "learned-prior"])
+def test_before_any_task_is_known_z_is_from_the_prior(tiny_pearl: MakePEARL, explorer: str) -> None:
+    z = begin(tiny_pearl(), explorer, n_envs=3).explorer
+    z.look(np.zeros((3, 2), dtype=np.float32))
+    assert np.isfinite(z.z).all() and np.abs(z.z).max() > 0.1
+    assert np.isfinite(z.deviation()).all() and 0.5 < z.deviation().mean() < 1.5
+
+
+# --- learned prior
+
+
+def test_the_learned_prior_draws_training_tasks_and_then_from_the_posterior(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    know_tasks(model, 6)
+    model.knowledge.is_train[4:6] = False
+    adaptation = begin(model, LearnedPrior(n_exploration_episodes=5), n_envs=200)
+    places, rewards = walk(adaptation, np.full(200, 2.0), n_episodes=8)
+    assert (places == places[..., :1]).all(), "one z an episode"
+    assert set(places[:, :5].flat) == {0, 1, 2, 3}, "draws with repetition, whatever was found"
+    seen = (rewards[:, :5] > 0).any(axis=(1, 2))
+    assert 0.7 < seen.mean() < 1 and (places[seen, 5:] == 2).mean() > 0.9
+    assert (places[~seen, 5:] == 2).mean() > 0.6, "its misses count, too"
+    assert not adaptation.explorer.exploring().any()
 
 
 def test_what_is_known_about_z_before_a_reward(tiny_pearl: MakePEARL) -> None:
     model = tiny_pearl()
     # The aggregate of a new model is N(0, I)
-    settings: list[tuple[Any, float]] = [("prior", 1.0), ("aggregate", 1.5), ("search", 1.5), (Search(scale=3.0), 3.0)]
+    settings: list[tuple[Any, float]] = [("prior", 1.0), ("aggregate", 1.5), (Aggregate(scale=3.0), 3.0)]
     for explorer, expected in settings:
         adaptation = model.start_adaptation(4, explorer=explorer)
         np.testing.assert_allclose(adaptation.explorer.deviation(), np.full((4, 3), expected), rtol=1e-6)
         mean, deviation = adaptation.posterior()
         assert (mean == 0).all() and (deviation == 1).all() and mean.shape == (4, 3)
-
-
-# --- the belief of search
-
-
-def test_search_finds_a_task_like_those_known_within_few_visits() -> None:
-    """Tasks on a line of which a visit finds its neighbours: the search skips what was ruled out, and no task escapes it."""
-    place = np.arange(40)
-    finds = np.abs(place[:, None] - place) <= 2
-    known = KnownTasks(
-        place[:, None].astype(np.float32), np.where(finds, 5.0, 0.0), np.where(finds, 3.0, np.inf)
-    )  # fmt: skip
-    belief, envs = TaskBelief(known, len(place)), place
-    first = np.zeros(len(place))
-    for visit in range(1, 14):
-        task = belief.to_find(envs)
-        hit = finds[task, envs]
-        first[hit & (first == 0)] = visit
-        belief.missed(envs[~hit], task[~hit], np.full((~hit).sum(), 20))
-        belief.found(envs[hit], task[hit], np.full(hit.sum(), 5.0))
-    assert (first > 0).all()
-    assert first.mean() < 6.5, "40 places, 5 with a visit: 4.5 on average were perfect"
-
-
-def test_belief_tells_two_sides_of_a_grazed_goal_apart() -> None:
-    """Both neighbours of a visit return the same; an earlier miss decides."""
-    place = np.arange(9.0)
-    distance = np.abs(place[:, None] - place)
-    returns = np.where(distance <= 2, 6.0 - 2 * distance, 0.0)
-    known = KnownTasks(place[:, None].astype(np.float32), returns, np.where(returns > 0, 3.0, np.inf))
-    belief = TaskBelief(known, 1)
-    env = np.zeros(1, dtype=np.int64)
-    belief.missed(env, np.array([2]), np.array([20]))  # rules 0 to 4 out
-    belief.found(env, np.array([4]), np.array([2.0]))  # 2 or 6
-    assert belief.to_exploit(env)[0] == 6
-
-
-@given(n=st.integers(1, 6), seed=st.integers(0, 2**16))
-def test_beliefs_stay_probabilities(n: int, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    returns = np.where(rng.random((n, n)) < 0.5, 0.0, 10 * rng.random((n, n))) + np.eye(n)
-    first = np.where(returns > 0, rng.integers(0, 20, (n, n)), np.inf)
-    belief = TaskBelief(KnownTasks(rng.normal(size=(n, 3)).astype(np.float32), returns, first), 2)
-    envs = np.arange(2)
-    for _ in range(60):
-        task = belief.to_find(envs) if rng.random() < 0.5 else belief.to_exploit(envs)
-        if rng.random() < 0.5:
-            belief.missed(envs, task, rng.integers(0, 30, 2))
-        else:
-            belief.found(envs, task, np.where(rng.random(2) < 0.3, np.nan, 20 * rng.random(2)))
-        assert (task < n).all() and np.isfinite(belief.belief).all()
-        np.testing.assert_allclose(belief.belief.sum(axis=1), 1)

@@ -12,17 +12,17 @@ from hypothesis import strategies as st
 from helpers import ENV_ID, ROLLOUT, MakePEARL
 from htr_envs import PointRobotFamily, Trajectory
 from sb3_htr import PEARL
-from sb3_htr.adaptation.knowledge import KnownTasks
+from sb3_htr.adaptation.knowledge import Particles
 from sb3_htr.adaptation.task_bank import TaskBank
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr.transitions import Transitions
 
-CPU = th.device("cpu")
+CONTEXT_SIZE = 20
 
 
 def make_bank(family: PointRobotFamily) -> TaskBank:
     env = gym.make(ENV_ID)
-    return TaskBank(family, Transitions(env.observation_space, env.action_space))
+    return TaskBank(family, Transitions(env.observation_space, env.action_space), CONTEXT_SIZE, seed=0)
 
 
 def walks(bank: TaskBank, n: int, seed: int, lengths: tuple[int, ...] = (20,)) -> list[np.ndarray]:
@@ -41,7 +41,7 @@ def walks(bank: TaskBank, n: int, seed: int, lengths: tuple[int, ...] = (20,)) -
 
 @given(st.integers(0, 99), st.sampled_from([(20,), (1, 7, 20), (20, 30)]), st.integers(1, 12))
 def test_each_task_has_the_best_of_all_episodes(seed: int, lengths: tuple[int, ...], chunk: int) -> None:
-    """By the formula of the reward, one task after the other."""
+    """By the formula of the reward, one task after the other; hindsight tasks since they are known."""
     family = PointRobotFamily(goal_distance=0.5, n_train_tasks=9)
     bank = make_bank(family)
     episodes = walks(bank, 12, seed, lengths)
@@ -50,15 +50,52 @@ def test_each_task_has_the_best_of_all_episodes(seed: int, lengths: tuple[int, .
         if i % chunk == 0:
             bank.update()
     bank.update()
-    for task, goal in enumerate(family.train_tasks):
+    solved = list(bank.solved().returns)
+    for task, goal in enumerate(bank.tasks):
         distance = [np.linalg.norm(e[:, bank.transitions.next_observation] - goal, axis=1) for e in episodes]
         returns = np.array([np.where(d < family.goal_radius, 1 - d, 0).sum() for d in distance])
+        if task >= bank.n_train:
+            assert 0 < bank.best_return[task] <= returns.max() + 1e-4
+            continue
         assert bank.best_return[task] == pytest.approx(returns.max(), abs=1e-4)
-        assert (task in bank.solved) == (returns.max() > 0)
+        assert (bank.length[task] > 0) == (returns.max() > 0)
         if returns.max() > 0:
+            assert solved.pop(0) == bank.best_return[task]
             kept = bank.episodes[task, : bank.length[task]]
-            alike = [len(e) == len(kept) and np.array_equal(e, kept) for e in episodes]
-            assert max(returns[alike]) == pytest.approx(returns.max(), abs=1e-4)
+            alike = np.array([np.isin(kept, e).all() and len(kept) == min(len(e), CONTEXT_SIZE) for e in episodes])
+            assert returns[alike].max() == pytest.approx(returns.max(), abs=1e-4)
+
+
+@given(st.integers(0, 99), st.integers(1, 30))
+def test_hindsight_tasks_are_as_far_apart_as_a_task_reaches(seed: int, n_episodes: int) -> None:
+    """None is solved by the state that made another; and what most of the new episodes reach solves one of them."""
+    family = PointRobotFamily(goal_distance=0.5, n_train_tasks=9)
+    bank = make_bank(family)
+    episodes = walks(bank, n_episodes, seed)
+    for episode in episodes:
+        bank.on_episode(0, episode)
+    bank.update()
+    goals = bank.tasks[bank.n_train :]
+    distance = np.linalg.norm(goals[:, None] - goals, axis=-1) + 9 * np.eye(len(goals))
+    assert distance.min() >= family.goal_radius - 1e-6
+    reached = np.concatenate([e[:, bank.transitions.next_observation] for e in episodes])
+    covered = np.linalg.norm(reached[:, None] - goals, axis=-1).min(axis=1) < family.goal_radius
+    assert covered.mean() > 0.5
+
+
+def test_of_too_many_hindsight_tasks_a_random_one_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_htr.adaptation.task_bank.MAX_HINDSIGHT_TASKS", 5)
+    bank = make_bank(PointRobotFamily(n_train_tasks=3))
+    seen = set()
+    for i in range(10):
+        for episode in walks(bank, 5, i):
+            bank.on_episode(0, episode)
+        bank.update()
+        assert len(bank.tasks) == bank.n_train + 5
+        seen |= {tuple(task) for task in bank.tasks[bank.n_train :]}
+        solved = bank.solved()
+        assert np.add.reduceat(solved.success, np.cumsum(solved.lengths) - solved.lengths).all(), "each is of an episode"
+    assert len(seen) > 10
 
 
 def test_episodes_count_when_they_are_taken_in_and_the_bank_has_copies() -> None:
@@ -67,17 +104,23 @@ def test_episodes_count_when_they_are_taken_in_and_the_bank_has_copies() -> None
     kept = episode.copy()
     bank.on_episode(3, episode)
     episode[:] = 99.0
-    assert len(bank.solved) == 0
+    assert len(bank.solved().lengths) == 0
     bank.update()
-    assert len(bank.solved) > 0
-    np.testing.assert_array_equal(bank.episodes[bank.solved[0]], kept)
+    solved = np.flatnonzero(bank.length)
+    assert len(solved) == len(bank.solved().lengths) > 0
+    np.testing.assert_array_equal(bank.episodes[solved[0]], kept)
     before = bank.best_return.copy()
     bank.update()
     np.testing.assert_array_equal(bank.best_return, before)
     other = make_bank(PointRobotFamily(goal_distance=0.1))
     other.load_state_dict(bank.state_dict())
-    for ours, theirs in zip(bank.best_episodes(20, CPU)[1:], other.best_episodes(20, CPU)[1:], strict=True):
+    for ours, theirs in zip(bank.solved(), other.solved(), strict=True):
         np.testing.assert_array_equal(ours, theirs)
+    for one in (bank, other):
+        for episode in walks(one, 3, 7):
+            one.on_episode(0, episode)
+        one.update()
+    np.testing.assert_array_equal(bank.tasks, other.tasks)
 
 
 class Counting(PointRobotFamily):
@@ -99,7 +142,7 @@ def cost(n_train_tasks: int) -> tuple[int, int]:
         bank.on_episode(0, episode)
     bank.update()
     size = sum(value.nbytes for value in vars(bank).values() if isinstance(value, np.ndarray))
-    bank.best_episodes(20, CPU)
+    bank.solved()
     return family.n_rewards, size
 
 
@@ -124,37 +167,44 @@ def test_up_to_128_training_tasks_are_all_kept_and_of_more_evenly_spread_ones(n:
 def test_a_family_of_many_tasks_trains(tiny_pearl: MakePEARL) -> None:
     env = make_task_vec_env(ENV_ID, 4, env_kwargs={"n_train_tasks": 500, "goal_distance": 0.3})
     model = tiny_pearl(env, buffer_size=500 * 20).learn(3 * ROLLOUT)
-    assert model.task_bank is not None
-    assert 20 < len(model.knowledge.known_tasks().z) == len(model.task_bank.solved) <= 128
+    particles = model.knowledge.particles()
+    assert model.task_bank is not None and int(particles.is_train.sum()) == model.task_bank.n_train_solved
+    assert 20 < int(particles.is_train.sum()) <= 128 and 5 < int((~particles.is_train).sum()) <= 256
 
 
-def test_known_tasks_are_those_that_were_ever_reached(tiny_pearl: MakePEARL) -> None:
+def test_particles_are_the_tasks_that_were_ever_reached(tiny_pearl: MakePEARL) -> None:
     """Under the reward formula, written down here once more, each best episode does what it is said to do."""
     model = tiny_pearl(make_task_vec_env(ENV_ID, 4, env_kwargs={"goal_distance": 0.3}))
     model.learn(4 * ROLLOUT)
     bank = model.task_bank
-    assert isinstance(bank, TaskBank) and len(bank.solved) > 20
-    context, returns, first_success = bank.best_episodes(20, CPU)
-    assert (context.lengths == 20).all()
-    obs, actions = (values.reshape(len(returns), 20, 2).numpy() for values in context[:2])
-    position = obs + 0.1 * np.clip(actions, -1, 1)
-    distance = np.linalg.norm(position[:, None] - bank.tasks[bank.solved][:, None], axis=-1)
-    reward = np.where(distance < 0.2, 1 - distance, 0)
-    np.testing.assert_allclose(returns, reward.sum(axis=-1), atol=0.9)  # a step on the rim may count or not
-    assert (np.diag(returns) > 0).all() and (np.diag(first_success) < 20).all()
-    np.testing.assert_array_equal(np.isfinite(first_success), returns > 0)
-    np.testing.assert_allclose(context.rewards.reshape(-1, 20), np.einsum("iit->it", reward), atol=0.9)
-    np.testing.assert_array_equal(model.knowledge.known_tasks().returns, returns)
-    assert bank.best_episodes(5, CPU)[0].lengths.tolist() == [5] * len(returns)
+    assert isinstance(bank, TaskBank)
+    solved, columns = bank.solved(), bank.transitions
+    goal = np.repeat(bank.tasks[bank.length > 0], solved.lengths, axis=0)
+    obs, action = solved.rows[:, columns.observation], solved.rows[:, columns.action]
+    distance = np.linalg.norm(obs + 0.1 * np.clip(action, -1, 1) - goal, axis=1)
+    inside = distance < 0.2
+    on_the_rim = np.abs(distance - 0.2) < 1e-5
+    assert ((solved.success == inside) | on_the_rim).all()
+    reward = solved.rows[:, columns.reward]
+    np.testing.assert_allclose(reward[~on_the_rim], np.where(inside, 1 - distance, 0)[~on_the_rim], atol=1e-5)
+    ends = np.cumsum(solved.lengths)
+    np.testing.assert_allclose(solved.returns, np.add.reduceat(reward, ends - solved.lengths), atol=1e-4)
+    particles = model.knowledge.particles()
+    n = len(solved.lengths)
+    assert len(particles.z) == n > 20
+    assert particles.gain.shape == particles.returns.shape == (n, n) and (particles.gain >= 0).all()
+    np.testing.assert_allclose(particles.returns.diag(), solved.returns, rtol=1e-4)
+    assert particles.log_prior.exp().sum().item() == pytest.approx(1, abs=1e-4)
+    np.testing.assert_array_equal(particles.is_train, solved.is_train)
 
 
-def test_known_tasks_of_a_loaded_model_are_not_replaced_by_fewer(tiny_pearl: MakePEARL, tmp_path: Any) -> None:
+def test_particles_of_a_loaded_model_are_not_replaced_by_fewer(tiny_pearl: MakePEARL, tmp_path: Any) -> None:
     """Without its replay buffer, a model knows few tasks when training goes on."""
     tiny_pearl().save(tmp_path / "model")
     loaded = PEARL.load(tmp_path / "model", env=make_task_vec_env(ENV_ID, 4, env_kwargs={"goal_distance": 0.2}))
-    for n, kept in ((128, True), (1, False)):
-        known = KnownTasks(np.ones((n, 3), np.float32), np.eye(n, dtype=np.float32), np.zeros((n, n), np.float32))
-        loaded.knowledge.set_known_tasks(known)
+    for n, kept in ((384, True), (1, False)):
+        known = Particles(th.ones(n, 3), th.eye(n), th.eye(n), th.zeros(n), th.ones(n, dtype=th.bool))
+        loaded.knowledge.set_particles(known)
         loaded.learn(ROLLOUT)
-        assert 1 < len(loaded.task_bank.solved) < 128  # type: ignore[union-attr]
-        assert (len(loaded.knowledge.known_tasks().z) == n) == kept
+        assert 1 < len(loaded.task_bank.solved().lengths) < 384  # type: ignore[union-attr]
+        assert (int(loaded.knowledge.n_particles) == n) == kept

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from sb3_htr.adaptation import Aggregate, Explorer, Prior, Search
+from sb3_htr.adaptation import Aggregate, Belief, Explorer, Prior
 from sb3_htr.adaptation.explorers import EXPLORERS, to_explorer
 from sb3_htr.common.settings import make
 from sb3_htr.htr import EpisodeClustering, Relabeller, SingleEpisodeRelabelling
@@ -15,9 +15,9 @@ Kinds = Mapping[str, Callable[..., Any]]
 
 
 def test_a_name_a_name_with_settings_and_an_object_are_the_same() -> None:
-    own = Search(scale=2.0)
+    own = Belief(margin=2.0)
     assert to_explorer(own) is own
-    assert to_explorer("search") == Search() and to_explorer({"name": "search", "scale": 2}) == own
+    assert to_explorer("belief") == Belief() and to_explorer({"name": "belief", "margin": 2}) == own
     assert to_explorer({"name": "prior", "n_exploration_episodes": 9}) == Prior(9)
     assert type(to_explorer("aggregate")) is Aggregate
 
@@ -26,7 +26,7 @@ def test_a_name_a_name_with_settings_and_an_object_are_the_same() -> None:
     ("what", "kinds", "base"), [("explorer", EXPLORERS, Explorer), ("relabeller", RELABELLERS, Relabeller)]
 )
 @pytest.mark.parametrize(
-    "value", ["nobody", {}, {"name": "nobody"}, {"name": None}, {"scale": 1}, None, 3, [], Search, {3: 4}]
+    "value", ["nobody", {}, {"name": "nobody"}, {"name": None}, {"scale": 1}, None, 3, [], Belief, {3: 4}]
 )
 def test_anything_else_is_answered_with_what_there_is(what: str, kinds: Kinds, base: Any, value: Any) -> None:
     with pytest.raises(ValueError, match=rf"{what} is .*, expected one of .*object derived from {base.__name__}") as error:
@@ -37,10 +37,12 @@ def test_anything_else_is_answered_with_what_there_is(what: str, kinds: Kinds, b
 @pytest.mark.parametrize(
     ("kinds", "base", "settings", "message"),
     [
-        (EXPLORERS, Explorer, {"name": "search", "max_setback": 2}, "'max_setback': did you mean max_setbacks"),
+        (EXPLORERS, Explorer, {"name": "aggregate", "max_setback": 2}, "'max_setback': did you mean max_setbacks"),
         (EXPLORERS, Explorer, {"name": "prior", "scale": 2}, "'prior' has no setting 'scale': expected one of"),
-        (EXPLORERS, Explorer, {"name": "search", "scale": -1}, "scale is -1, expected a number of at least 0"),
-        (EXPLORERS, Explorer, {"name": "search", "clearly_better": 0.9}, "clearly_better is 0.9, expected a number of at"),
+        (EXPLORERS, Explorer, {"name": "aggregate", "scale": -1}, "scale is -1, expected a number of at least 0"),
+        (EXPLORERS, Explorer, {"name": "aggregate", "clearly_better": 0.9}, "clearly_better is 0.9, expected a number of at"),
+        (EXPLORERS, Explorer, {"name": "belief", "doubt": 0.6}, "doubt is 0.6, expected a number from 1e-06 to 0.5"),
+        (EXPLORERS, Explorer, {"name": "learned-prior", "temperature": 2}, "temperature is 2, expected a number from 0 to 1"),
         (EXPLORERS, Explorer, {"name": "aggregate", "max_setbacks": 1.5}, "max_setbacks is 1.5, expected a whole number"),
         (EXPLORERS, Explorer, {"name": "prior", "n_exploration_episodes": -1}, "n_exploration_episodes is -1"),
         (RELABELLERS, Relabeller, {"name": "EpisodeClustering", "cellsize": 1}, "'cellsize': did you mean cell_size"),

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from helpers import ENV_ID, ROLLOUT, MakePEARL, many
 from helpers.bombs import Bomb, bombs
 from sb3_htr import PEARL, evaluate_adaptation, load_untrusted
-from sb3_htr.adaptation import Prior, Search
+from sb3_htr.adaptation import Belief, Prior
 from sb3_htr.common.vec_env import make_task_vec_env
 
 
@@ -73,18 +73,18 @@ def test_loading_an_untrusted_model_runs_no_code(tiny_pearl: MakePEARL, tmp_path
     repack(tmp_path / "model.zip", tmp_path / "bomb.zip", {"data": json.dumps(hostile).encode()})
     with pytest.raises(ValueError, match=r"explorer is {}, expected one of"):
         load_untrusted(tmp_path / "bomb.zip", ENV_ID)
-    load_untrusted(tmp_path / "bomb.zip", ENV_ID, explorer="search")
+    load_untrusted(tmp_path / "bomb.zip", ENV_ID, explorer="belief")
     assert not fuse.exists()
 
 
 def test_an_untrusted_model_acts_as_the_one_that_was_saved(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
-    explorers: dict[str, Any] = {"explorer": Search(scale=2.0), "train_explorer": Prior(2)}
+    explorers: dict[str, Any] = {"explorer": Belief(margin=2.0), "train_explorer": Prior(2)}
     model = tiny_pearl(gamma=0.7, kl_coef=0.02, context_size=7, **explorers).learn(3 * ROLLOUT)
     model.save(tmp_path / "model.zip")
     loaded = load_untrusted(tmp_path / "model.zip", ENV_ID)
     assert loaded.gamma == 0.7 and loaded.kl_coef == 0.02 and loaded.context_size == 7
     assert loaded.num_timesteps == model.num_timesteps and loaded._n_updates == model._n_updates
-    assert loaded.explorer == Search(scale=2.0) and loaded.train_explorer == Prior(2)
+    assert loaded.explorer == Belief(margin=2.0) and loaded.train_explorer == Prior(2)
     assert load_untrusted(tmp_path / "model.zip", ENV_ID, explorer="prior").explorer == Prior()
     for a, b in zip(evaluate_adaptation(model, ENV_ID), evaluate_adaptation(loaded, ENV_ID), strict=True):
         np.testing.assert_array_equal(a, b)

@@ -211,4 +211,4 @@ def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixtu
 
 def test_tables_show_the_last_episode() -> None:
     record = AdaptationRecord(np.ones((2, 7)), np.ones((2, 7), dtype=bool), np.zeros((2, 7, 1, 1), dtype=np.float32))
-    assert [line.split()[1] for line in model_card.table({"search": record}).splitlines()[2:]] == ["1", "2", "3", "5", "7"]
+    assert [line.split()[1] for line in model_card.table({"belief": record}).splitlines()[2:]] == ["1", "2", "3", "5", "7"]

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from helpers import ENV_ID, TINY, MakePEARL
 from helpers.runs import make_run, run_folder, train_arguments
 from sb3_htr import PEARL
-from sb3_htr.adaptation import Prior, Search
+from sb3_htr.adaptation import Belief, Prior
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run.agents import RECORD, agent_for
 from sb3_htr.zoo.run.method import get_method, merged, methods
@@ -30,7 +30,7 @@ def test_what_the_methods_are() -> None:
     assert dense == {"pearl-dense", "pearl-dense-prior"}
     for name in OWN:
         method, prior = get_method(name), get_method(f"{name}-prior")
-        assert (method.train_explorer, method.explorer) == ("aggregate", "search"), "methods differ in one thing at a time"
+        assert (method.train_explorer, method.explorer) == ("aggregate", "belief"), "methods differ in one thing at a time"
         assert (prior.train_explorer, prior.explorer) == ("prior", "prior") and "PEARL's protocol" in prior.label
         assert merged(prior.hyperparams(), {key: method.hyperparams()[key] for key in ("explorer", "train_explorer")}) == (
             method.hyperparams()
@@ -89,7 +89,7 @@ def test_a_name_and_settings_of_what_it_names_are_joined() -> None:
 
 def test_settings_of_file_method_and_command_line_are_joined_in_this_order(tmp_path: Path) -> None:
     block: dict[str, Any] = {key: value for key, value in TINY.items() if key != "seed"}
-    block |= {"policy": "MlpPolicy", "n_timesteps": 240, "n_envs": 4, "explorer": {"name": "prior", "scale": 2.5}}
+    block |= {"policy": "MlpPolicy", "n_timesteps": 240, "n_envs": 4, "explorer": {"name": "prior", "margin": 2.5}}
     block["replay_buffer_kwargs"] = {
         "relabeller": {"name": "SingleEpisodeRelabelling", "hindsight_task_strategy": "final"},
         "relabel_probability": 0.1,
@@ -97,14 +97,14 @@ def test_settings_of_file_method_and_command_line_are_joined_in_this_order(tmp_p
     }
     (tmp_path / "my.yml").write_text(yaml.safe_dump({ENV_ID: block}))
     arguments = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(tmp_path / "my.yml"), "--eval-freq", "-1"]
-    given = ["replay_buffer_kwargs:{'relabeller':{'cell_size':0.3}}", "explorer:{'max_setbacks':2}"]
+    given = ["replay_buffer_kwargs:{'relabeller':{'cell_size':0.3}}", "explorer:{'doubt':0.1}"]
     assert main([*arguments, "--verbose", "0", "--method", "htr-ec", "-params", *given]) == 0
     run = run_folder(tmp_path, "htr-ec")
     buffer = {"relabel_probability": 0.8, "rl_reward_type": "sparse", "context_episodes": 3}
     relabeller = {"name": "EpisodeClustering", "hindsight_task_strategy": "final", "cell_size": 0.3}
     model = PEARL.load(run / f"{ENV_ID}.zip")
     assert model.replay_buffer_kwargs == {**buffer, "relabeller": relabeller}
-    assert model.explorer == Search(scale=2.5, max_setbacks=2)
+    assert model.explorer == Belief(margin=2.5, doubt=0.1)
     record = json.loads((run / RECORD).read_text())
     assert record["hyperparams"]["replay_buffer_kwargs"] == {**buffer, "relabeller": relabeller}
 
@@ -120,7 +120,7 @@ def test_settings_of_file_method_and_command_line_are_joined_in_this_order(tmp_p
             "'SingleEpisodeRelabelling' has no setting 'ce",
         ),
         (["--method", "htr-ec", "-params", "replay_buffer_kwargs:{'relabeller':{'rl_batch_source':'task'}}"], "'EpisodeClu"),
-        (["-params", "explorer:{'scal':0.3}"], "explorer 'search' has no setting 'scal': did you mean scale"),
+        (["-params", "explorer:{'margn':0.3}"], "explorer 'belief' has no setting 'margn': did you mean margin"),
         (["-params", "explorer:'nobody'"], "explorer is 'nobody', expected one of"),
         (["-params", "n_exploration_episodes:3"], "PEARL has no setting 'n_exploration_episodes'"),
         (
@@ -177,7 +177,7 @@ def test_enjoy_takes_the_agent_of_the_method_that_is_asked_for(
     for name in ("htr-ec", "pearl-sparse-prior", "pearl-dense"):
         assert main([*few, "--method", name]) == 0
         said[name] = capsys.readouterr().out.splitlines()[0]
-    assert said["htr-ec"].startswith("logs/htr-ec/") and said["htr-ec"].endswith("explorer 'search'")
+    assert said["htr-ec"].startswith("logs/htr-ec/") and said["htr-ec"].endswith("explorer 'belief'")
     assert said["pearl-sparse-prior"].startswith("logs/pearl-sparse-prior/")
     assert said["pearl-sparse-prior"].endswith("explorer 'prior'")
     assert f"trained_agents/pearl-dense/{ENV_ID}.zip" in said["pearl-dense"], "there is none in the logs, so the shipped one"

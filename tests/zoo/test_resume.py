@@ -101,7 +101,7 @@ def test_a_finished_run_says_so(unbroken: Path, capsys: pytest.CaptureFixture[st
     [
         ["replay_buffer_kwargs:{'relabeller':'EpisodeClustering'}"],
         [NETS[-1].replace("}", ",'normalize_observations':True}"), "ent_coef:'auto'", "learning_rate:'lin_1e-3'"],
-        ["train_explorer:'search'", "explorer:{'name':'prior','n_exploration_episodes':1}"],
+        ["train_explorer:'belief'", "explorer:{'name':'prior','n_exploration_episodes':1}"],
         ["env_wrapper:'gymnasium.wrappers.OrderEnforcing'"],  # single envs instead of a batch
     ],
 )

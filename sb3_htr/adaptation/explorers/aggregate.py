@@ -7,14 +7,10 @@ import numpy as np
 
 from sb3_htr.adaptation.explorers.base import Explorer
 from sb3_htr.common.checks import check_numbers
+from sb3_htr.common.task_reward import ROUNDING
 
 if TYPE_CHECKING:
     from sb3_htr.adaptation.adaptation import Step
-
-# Of returns, which are sums of float32
-ROUNDING = 1e-5
-# What an episode counts for that found the reward, but with more than one z, so that it cannot be repeated with one
-FOUND = 2 * ROUNDING
 
 
 @dataclass
@@ -53,11 +49,9 @@ class Aggregate(Explorer):
     def start(self) -> None:
         n_envs, latent_dim = self.adaptation.n_envs, self.adaptation.policy.latent_dim
         self.z = np.zeros((n_envs, latent_dim), dtype=np.float32)
-        # Of the best episode that had one z from its beginning to its end
+        # Of the best episode
         self._best_return = np.zeros(n_envs, dtype=np.float64)
         self._best_z = np.zeros_like(self.z)
-        # Whether z has changed within the running episode
-        self._turned = np.zeros(n_envs, dtype=bool)
         # Episodes since one was clearly better
         self._setbacks = np.zeros(n_envs, dtype=np.int64)
         self._draw(np.arange(n_envs))
@@ -67,14 +61,12 @@ class Aggregate(Explorer):
         if len(ended) == 0:
             return
         returns = self.adaptation.episode_return
-        returns = np.where(self._turned, np.minimum(returns, FOUND), returns)
         better = ended[returns[ended] > self._best_return[ended] + 0.5 * ROUNDING]
         clearly_better = better[returns[better] > self.clearly_better * self._best_return[better]]
         self._best_return[better] = returns[better]
         self._best_z[better] = self.z[better]
         self._setbacks[ended] += 1
         self._setbacks[clearly_better] = 0
-        self._turned[ended] = False
         self.adaptation.infer(better, keep=False)
         self._draw(ended)
 
@@ -104,4 +96,4 @@ class Aggregate(Explorer):
 
     def _settled(self, envs: np.ndarray) -> np.ndarray:
         """(k,) bool, whether to repeat the best episode."""
-        return np.asarray((self._setbacks[envs] >= self.max_setbacks) & (self._best_return[envs] > FOUND))
+        return np.asarray((self._setbacks[envs] >= self.max_setbacks) & (self._best_return[envs] > 0))

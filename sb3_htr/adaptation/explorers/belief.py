@@ -8,6 +8,7 @@ import torch as th
 
 from sb3_htr.adaptation.explorers.particles import ParticleExplorer
 from sb3_htr.common.checks import check_numbers
+from sb3_htr.common.task_reward import ROUNDING
 
 if TYPE_CHECKING:
     from sb3_htr.adaptation.adaptation import Step
@@ -26,9 +27,10 @@ class Belief(ParticleExplorer):
     The explorer that is the default at meta-test.
 
     Before the first reward, z is that of the particle whose episode would earn most, and soonest: what the belief expects its
-    rewarded steps to earn, times the critics' value of going there from here; chosen anew within an episode. After it, each
-    episode has one z, the one that promises the largest return: of a particle, under the same belief; of the best episode so
-    far, what it returned; and the encoder's posterior mean, given a new best episode, is tried once.
+    rewarded steps to earn, times the critics' value of going there from here, beside what unrewarded steps return; chosen anew
+    within an episode. After it, each episode has one z, the one that promises the largest return: of a particle, under the
+    same belief; of the best episode so far, what it returned; and the encoder's posterior mean, given a new best episode, is
+    tried once.
 
     :param margin: a particle must promise so many times what the best episode returned, to be tried in its place
     """
@@ -82,7 +84,8 @@ class Belief(ParticleExplorer):
         with th.no_grad():
             gain, index = (self.weights(envs) @ self.particles.gain.T).topk(n_compared, dim=1)
             z = self.particles.z[index]
-            promise = gain * self.adaptation.policy.values(obs[envs], z).clamp(min=MIN_VALUE)
+            beside = self.adaptation.policy.values(obs[envs], z) - self.adaptation.knowledge.task_free_value
+            promise = gain * beside.clamp(min=MIN_VALUE)
         chosen = z[th.arange(len(envs)), promise.argmax(dim=1)].cpu().numpy()
         self._turned[envs] |= ~self._at_start[envs] & (chosen != self.z[envs]).any(axis=1)
         self.z[envs] = chosen
@@ -114,9 +117,9 @@ class Belief(ParticleExplorer):
         episode_return = self.adaptation.episode_return
         returns, particle = episode_return[envs], self._particle[envs]
         self._tried[envs[particle >= 0], particle[particle >= 0]] = True
-        better = envs[returns > self.margin * self._best_return[envs] + 1e-5]
+        better = envs[returns > self.margin * self._best_return[envs] + ROUNDING]
         self._best_return[envs] = np.maximum(self._best_return[envs], returns)
-        repeatable = envs[~self._turned[envs] & (returns > self._best_z_return[envs] + 1e-5)]
+        repeatable = envs[~self._turned[envs] & (returns > self._best_z_return[envs] + ROUNDING)]
         self._best_z[repeatable], self._best_z_return[repeatable] = self.z[repeatable], episode_return[repeatable]
         self.adaptation.infer(better, keep=False)
         self._proposal[better] = self.adaptation.posterior(better)[0]

@@ -27,7 +27,8 @@ class ParticleExplorer(Explorer):
 
     Nothing else is used than observations, actions and rewards.
 
-    :param doubt: probability of a success where the model excludes one, and of none where it is sure of one
+    :param doubt: probability of a success where the model excludes one, and of none where it is sure of one; above 0, so that
+        no reward is impossible
     :param temperature: power of each step's likelihood: steps of an episode are not independent
     :param noise: smallest standard deviation of rewards around those expected, relative to the mean reward of a success
     """
@@ -39,7 +40,7 @@ class ParticleExplorer(Explorer):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_numbers(
-            doubt=(self.doubt, 0.0, 0.5),
+            doubt=(self.doubt, 1e-6, 0.5),
             temperature=(self.temperature, 0.0, 1.0),
             noise=(self.noise, 0.0, float("inf")),
         )

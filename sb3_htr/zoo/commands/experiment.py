@@ -13,20 +13,22 @@ EXAMPLE = """  sb3-htr experiment point_robot --jobs 2
 def main(argv: Sequence[str]) -> None:
     """The command, with its arguments."""
     # Experiments use the zoo, and not the other way round
-    grid, report = (importlib.import_module(f"sb3_htr.experiments.{name}") for name in ("grid", "report"))
-    names = "\n".join(f"  {name:<14} {experiment.env_id}: {experiment.about}" for name, experiment in grid.EXPERIMENTS.items())
+    grid, report, runner = (importlib.import_module(f"sb3_htr.experiments.{name}") for name in ("grid", "report", "runner"))
+    names = "\n".join(f"  {name:<16} {experiment.env_id}: {experiment.about}" for name, experiment in grid.EXPERIMENTS.items())
     parser = make_parser("experiment", f"Repeat an experiment; a killed one goes on where it stopped.\n\n{names}", EXAMPLE)
     parser.add_argument("name", choices=list(grid.EXPERIMENTS), metavar="NAME", help="one of the above")
     parser.add_argument("--seeds", type=int, help="runs of each variant (default: those of the experiment)")
     parser.add_argument("--jobs", type=int, default=2, help="runs at a time, each on one thread (default: 2)")
     parser.add_argument("--quick", action="store_true", help="one seed, a tenth of the env steps")
-    parser.add_argument("--runs", type=Path, help="folder for the runs; resumes from it (default: runs/NAME)")
+    runs = "folder for the runs; those of an experiment resume from RUNS/NAME (default: runs)"
+    parser.add_argument("--runs", type=Path, default=Path("runs"), help=runs)
     parser.add_argument("-o", "--output", type=Path, help="folder for the results (default: results/NAME)")
     args = parser.parse_args(argv)
     experiment = grid.EXPERIMENTS[args.name]
     cells = experiment.cells(1, 0.1) if args.quick else experiment.cells(args.seeds)
     quick = "quick-" if args.quick else ""
-    runs, output = args.runs or Path("runs", quick + args.name), args.output or Path("results", quick + args.name)
+    output = args.output or Path("results", quick + args.name)
     how = "--quick" if args.quick else f"--seeds {len({cell.seed for cell in cells})}"
-    report.run(args.name, f"sb3-htr experiment {args.name} {how}", experiment, cells, runs, output, args.jobs)
+    results = runner.run_cells(cells, args.runs / "quick" if args.quick else args.runs, args.jobs)
+    report.write(f"sb3-htr experiment {args.name} {how}", experiment, results, output)
     print(f"Results: {output}")

@@ -1,0 +1,91 @@
+"""One run of an experiment: what is trained, and how the final model is tested."""
+
+import re
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+KwArgs = dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """
+    One training run and its tests.
+
+    :param experiment: name of the experiment
+    :param models_of: name of the experiment whose runs these are; often the same
+    :param env_id: registered env
+    :param method: name in hyperparams/methods.yml
+    :param variant: name in tables and folders
+    :param seed: seed of the run
+    :param n_timesteps: budget of env steps
+    :param eval_freq: env steps between evaluations on the validation tasks
+    :param settings: hyperparameters, joined with those of env and method
+    :param env_kwargs: arguments of the env
+    :param explorers: how the final model explores on the test tasks; one row of results for each
+    :param elsewhere: arguments of the envs that the final model is tested on as well, beside those of training
+    """
+
+    experiment: str
+    models_of: str
+    env_id: str
+    method: str
+    variant: str
+    seed: int
+    n_timesteps: int
+    eval_freq: int
+    settings: KwArgs
+    env_kwargs: KwArgs
+    explorers: tuple[str, ...]
+    elsewhere: tuple[KwArgs, ...]
+
+    @property
+    def name(self) -> str:
+        """Of its folder."""
+        kwargs = "".join(f"-{key}{value}" for key, value in self.env_kwargs.items())
+        return re.sub(r"[^\w.=-]+", "_", f"{self.variant}{kwargs}-seed{self.seed}".replace(" ", ""))
+
+    def run_folder(self, runs: Path) -> Path:
+        """
+        :param runs: folder of all experiments' runs
+        :return: log folder of its training
+        """
+        return runs / self.models_of / self.name
+
+    def result(self, runs: Path) -> Path:
+        """
+        :param runs: folder of all experiments' runs
+        :return: file of its raw results
+        """
+        return runs / self.experiment / f"{self.name}.npz"
+
+    @property
+    def tests(self) -> list[tuple[str, KwArgs]]:
+        """Explorers, and the arguments of the env that are other than in training: what the final model is tested with."""
+        return [(explorer, tested_on) for tested_on in ({}, *self.elsewhere) for explorer in self.explorers]
+
+    def training(self, folder: Path) -> list[str]:
+        """
+        :param folder: log folder
+        :return: command line of the training
+        """
+        settings = [f"{key}:{value!r}" for key, value in self.settings.items()]
+        kwargs = [f"{key}:{value!r}" for key, value in self.env_kwargs.items()]
+        return [
+            *(sys.executable, "-m", "sb3_htr.zoo.cli", "train", "--env", self.env_id, "--method", self.method),
+            *("-f", str(folder), "--verbose", "0", "-n", str(self.n_timesteps)),
+            *("--seed", str(self.seed), "--eval-freq", str(self.eval_freq)),
+            *(["-params", *settings] if settings else []),
+            *(["--env-kwargs", *kwargs] if kwargs else []),
+        ]
+
+
+def name_of_test(explorer: str, tested_on: KwArgs) -> str:
+    """
+    :param explorer: name
+    :param tested_on: arguments of the env that are other than in training
+    :return: how raw results name this test
+    """
+    return " ".join([explorer, *(f"{key}={value}" for key, value in tested_on.items())])
