@@ -374,6 +374,7 @@ def test_a_method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
         assert main(train_arguments(tmp_path, 480, "--method", "half-half")) == 0
         run = run_folder(tmp_path, "half-half")
         model = agent_at(run, "last").load(trust=True)
+        assert isinstance(model, PEARL)
         assert json.loads((run / RECORD).read_text())["method"] == "half-half"
         assert (model.explorer.name, model.train_explorer.name) == ("aggregate", "belief")
         buffer: Any = model.replay_buffer_kwargs

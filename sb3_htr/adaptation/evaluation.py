@@ -10,7 +10,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_htr.adaptation.loop import Adapts, adaptation_steps
+from sb3_htr.adaptation.loop import Adapts, Watched, adaptation_steps
 from sb3_htr.common.checks import check_is_not_normalized, get_task_family
 from sb3_htr.common.vec_env import make_task_vec_env
 
@@ -37,7 +37,7 @@ class MetaLearner(Protocol):
         """How it explores unless told otherwise."""
         ...
 
-    def start_adaptation(self, n_envs: int, explorer: Any = None, generator: th.Generator | None = None) -> Adapts:
+    def start_adaptation(self, n_envs: int, explorer: Any = None, generator: th.Generator | None = None) -> Watched:
         """Begin to adapt to one task per env."""
         ...
 

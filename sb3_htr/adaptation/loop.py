@@ -20,6 +20,10 @@ class Adapts(Protocol):
         """Take in one step of each env."""
         ...
 
+
+class Watched(Adapts, Protocol):
+    """An adaptation that tells whoever watches it where it stands."""
+
     def exploring(self) -> np.ndarray:
         """(n_envs,) bool, whether nothing is known about the task yet but what was tried in vain."""
         ...

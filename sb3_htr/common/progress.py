@@ -1,15 +1,9 @@
 """A progress bar for trainings that spend most of their time between env steps."""
 
 import time
-from typing import Any, Protocol, cast
+from typing import Any
 
 from stable_baselines3.common.callbacks import ProgressBarCallback
-
-
-class Updates(Protocol):
-    """A model that says when it has done an update."""
-
-    update_listeners: list[Any]
 
 
 class MetaProgressBarCallback(ProgressBarCallback):
@@ -29,7 +23,9 @@ class MetaProgressBarCallback(ProgressBarCallback):
     def _on_training_start(self) -> None:
         super()._on_training_start()
         self.pbar.smoothing = 0.05
-        cast(Updates, self.model).update_listeners.append(self._on_update)
+        # A model that does not tell has SB3's bar
+        self._listeners: list[Any] = getattr(self.model, "update_listeners", [])
+        self._listeners.append(self._on_update)
 
     def _on_rollout_start(self) -> None:
         now = time.monotonic()
@@ -46,7 +42,7 @@ class MetaProgressBarCallback(ProgressBarCallback):
 
     def _on_rollout_end(self) -> None:
         self._rollout_end = time.monotonic()
-        self._per_update = self._credit / max(cast(Any, self.model).gradient_steps, 1)
+        self._per_update = self._credit / max(getattr(self.model, "gradient_steps", 1), 1)
 
     def _on_update(self) -> None:
         self._n_updates += 1
@@ -54,7 +50,7 @@ class MetaProgressBarCallback(ProgressBarCallback):
         self.pbar.update(self._per_update)
 
     def _on_training_end(self) -> None:
-        cast(Updates, self.model).update_listeners.remove(self._on_update)
+        self._listeners.remove(self._on_update)
         self._settle()
         super()._on_training_end()
 

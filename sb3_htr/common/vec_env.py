@@ -6,7 +6,7 @@ import importlib
 import os
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -98,6 +98,21 @@ class BatchedTaskVecEnv(VecEnv):
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         return [None] * self.num_envs
+
+
+def set_tasks(env: VecEnv, task_ids: np.ndarray | None, indices: np.ndarray) -> None:
+    """
+    Choose the tasks of some envs from their next resets on.
+
+    :param env: env of a task family
+    :param task_ids: (n,) int, indices into the training tasks, or None to let the envs draw one at each reset
+    :param indices: (n,) int, which envs are meant
+    """
+    if isinstance(env.unwrapped, BatchedTaskVecEnv):
+        cast(Any, env.unwrapped.vector_env).set_task(task_ids, indices)
+    else:
+        for i, index in enumerate(indices):
+            env.env_method("set_task", None if task_ids is None else int(task_ids[i]), indices=int(index))
 
 
 class PatientResultsWriter(ResultsWriter):

@@ -3,13 +3,14 @@
 import numpy as np
 import torch as th
 
-from sb3_htr.adaptation.context import evenly_spread
 from sb3_htr.adaptation.loop import adaptation_steps
 from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.type_aliases import Context, Trajectory
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.experiments.cell import KwArgs
+from sb3_htr.htr.episode_store import evenly_spread
 from sb3_htr.pearl.pearl import PEARL
+from sb3_htr.zoo.run.algorithm import Model
 
 # Equal parts of [0, 1]
 N_BINS = 10
@@ -17,7 +18,7 @@ N_BINS = 10
 N_EPISODES = 20
 
 
-def calibration(model: PEARL, env_id: str, env_kwargs: KwArgs) -> np.ndarray:
+def calibration(model: Model, env_id: str, env_kwargs: KwArgs) -> np.ndarray:
     """
     The model adapts to the validation tasks. Each state that was reached, with each task that was solved, is a pair:
     p(success | s', z), z being the posterior mean given the task's best episode, against whether the state solves the task.
@@ -25,8 +26,11 @@ def calibration(model: PEARL, env_id: str, env_kwargs: KwArgs) -> np.ndarray:
     :param model: at the end of its training
     :param env_id: registered env
     :param env_kwargs: arguments of the env
-    :return: (N_BINS, 3) float64, of the pairs whose probability is in a bin: how many, sum of probabilities, successes
+    :return: (N_BINS, 3) float64, of the pairs whose probability is in a bin: how many, sum of probabilities, successes. No
+        pairs for a model without a reward model
     """
+    if not isinstance(model, PEARL):
+        return np.zeros((N_BINS, 3))
     family = get_task_family(make_task_vec_env(env_id, env_kwargs=env_kwargs))
     tasks = family.validation_tasks
     env = make_task_vec_env(env_id, len(tasks), seed=0, env_kwargs=env_kwargs)

@@ -175,6 +175,8 @@ def reliability(results: Results, path: Path) -> None:
     groups = by_variant(results)
     for (colour, _), (variant, runs) in zip(curve_styles([*groups]), groups.items(), strict=True):
         bins = np.sum([raw["calibration"] for _, raw in runs], axis=0)
+        if not bins.any():
+            continue
         n, probability, successes = bins[bins[:, 0] > 0].T
         label = f"{variant}: expected calibration error {expected_calibration_error(bins):.3f}"
         axes.plot(probability / n, successes / n, "o-", color=colour, markersize=4, label=label)

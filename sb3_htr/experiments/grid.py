@@ -8,6 +8,7 @@ from typing import Any
 from sb3_htr.experiments import figures
 from sb3_htr.experiments.ablations import ABLATIONS
 from sb3_htr.experiments.cell import Cell, KwArgs
+from sb3_htr.zoo.run.method import get_method
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +76,7 @@ class Experiment:
                 eval_freq=max(int(self.eval_freq * scale), 1),
                 settings=variant.settings,
                 env_kwargs=variant.env_kwargs,
-                explorers=self.explorers,
+                explorers=get_method(variant.method).explorers(self.explorers),
                 elsewhere=self.elsewhere,
             )
             for seed in range(1, (seeds or self.seeds) + 1)

@@ -11,7 +11,7 @@ from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.experiments.ablations import ABLATIONS
 from sb3_htr.experiments.calibration import calibration
 from sb3_htr.experiments.cell import Cell, KwArgs, name_of_test
-from sb3_htr.pearl.pearl import PEARL
+from sb3_htr.zoo.run.algorithm import Model
 
 # A final model adapts to all test tasks once for each: of starting states, and of all that an explorer draws
 EVAL_SEEDS = (1, 2, 3, 4, 5)
@@ -21,7 +21,7 @@ MIN_RUNS = 5
 Raw = Mapping[str, np.ndarray]
 
 
-def evaluate(cell: Cell, model: PEARL) -> KwArgs:
+def evaluate(cell: Cell, model: Model) -> KwArgs:
     """
     :param cell: what the model is tested with
     :param model: at the end of its training

@@ -50,8 +50,12 @@ def summarize(command: str, results: dict[Cell, Path]) -> dict[str, Any]:
                     interval = _rounded(iqm_interval(scores(raws, metric, test)))
                     rows.append({**tested, "metric": metric, **interval, **means})
                 returns = scores(raws, "last_episode_return", test)
-                reference = references.setdefault(test, returns)
-                if variant != compared:
+                if variant == compared:
+                    references[test] = returns
+                else:
+                    # What explores in a way of its own is compared with the first explorer
+                    first_explorer = name_of_test(variants[compared][0].explorers[0], tested_on)
+                    reference = references.get(test, references[first_explorer])
                     difference = {**tested, "of": compared, "metric": "last_episode_return"}
                     differences.append({**difference, **_rounded(iqm_difference(reference, returns))})
     commits = sorted({str(np.load(path)["commit"]) for path in results.values()})

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 import htr_envs  # noqa: F401 registers the envs
-from sb3_htr import PEARL
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.resume import checkpoints
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.protocol import evaluate, last_episode_return
 from sb3_htr.zoo.run.agents import RECORD, agent_at, file_stem, find_runs, read_record
+from sb3_htr.zoo.run.algorithm import Model
 
 # Means over the training of what HTR paper, B.2 reasons with
 LOGGED = ("relabelled_fraction", "rl_reward_mean", "rl_zero_reward_fraction")
@@ -29,7 +29,8 @@ def run_cell(cell: Cell, runs: Path) -> Path:
     :param cell: what to run
     :param runs: folder of all experiments' runs; a cell that has a result there is not run again
     :return: npz with ``timesteps``, ``curve`` (n, n_tasks) on validation tasks; what
-        :func:`sb3_htr.experiments.protocol.evaluate` tells of the final model; the means of what is in ``LOGGED``;
+        :func:`sb3_htr.experiments.protocol.evaluate` tells of the final model; the means of what is in ``LOGGED``,
+        NaN for an algorithm that does not log it;
         ``wall_s`` of the training and ``commit`` of the code that trained
     :raises ValueError: if the run in the cell's folder is another one
     """
@@ -48,8 +49,9 @@ def run_cell(cell: Cell, runs: Path) -> Path:
     run, model = trained
     evaluations = np.load(run / "evaluations.npz")
     progress = np.genfromtxt(run / "progress.csv", delimiter=",", names=True, deletechars="")
+    logged = progress.dtype.names or ()
     arrays: dict[str, Any] = {
-        **{key: np.nanmean(progress[f"train/{key}"]) for key in LOGGED},
+        **{key: np.nanmean(progress[f"train/{key}"]) if f"train/{key}" in logged else np.nan for key in LOGGED},
         "timesteps": evaluations["timesteps"],
         "curve": evaluations["results"],
         "wall_s": _wall_time(progress["time/time_elapsed"]),
@@ -63,7 +65,7 @@ def run_cell(cell: Cell, runs: Path) -> Path:
     return result
 
 
-def find_finished(cell: Cell, folder: Path) -> tuple[Path, PEARL] | None:
+def find_finished(cell: Cell, folder: Path) -> tuple[Path, Model] | None:
     """
     :param cell: what was to be trained
     :param folder: log folder

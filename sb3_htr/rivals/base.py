@@ -12,7 +12,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.adaptation import Step
-from sb3_htr.adaptation.loop import Adapts
+from sb3_htr.adaptation.loop import Watched
 from sb3_htr.common.saving import AtomicSave
 from sb3_htr.common.training_state import get_training_state, set_random_state, set_training_state
 
@@ -55,6 +55,34 @@ class RivalAdaptation:
         return np.full(self.n_envs, np.nan)
 
 
+class ToldAdaptation(RivalAdaptation):
+    """
+    No adaptation at all: who acts is told the tasks.
+
+    :param n_envs: number of tasks
+    :param act: observations (n_envs, obs_dim), tasks (n_envs, task_dim) and whether actions are to be means instead of
+        samples, to actions (n_envs, action_dim) scaled to [-1, 1]
+    """
+
+    def __init__(self, n_envs: int, act: Callable[[np.ndarray, np.ndarray, bool], np.ndarray]) -> None:
+        super().__init__(n_envs)
+        self._act = act
+
+    def see_tasks(self, tasks: np.ndarray) -> None:
+        """
+        :param tasks: (n_envs, task_dim)
+        """
+        self._tasks = tasks
+
+    def act(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
+        """
+        :param obs: (n_envs, obs_dim)
+        :param deterministic: mean actions instead of samples
+        :return: (n_envs, action_dim), scaled to [-1, 1]
+        """
+        return self._act(obs, self._tasks, deterministic)
+
+
 class FreshStart(BaseCallback):
     """Resets all envs where a rollout begins, after other callbacks had a look: so that nothing of an env need be saved."""
 
@@ -84,16 +112,11 @@ class Rival(AtomicSave, BaseAlgorithm):
     #: Of a training that goes on: takes effect once learn() has set everything up, which draws random numbers
     _pending_random: dict[str, Any] | None = None
 
-    @property
-    def update_listeners(self) -> list[Callable[[], None]]:
-        """Nobody is told of single updates."""
-        return []
-
     @abstractmethod
-    def _adaptation(self, n_envs: int, generator: th.Generator | None) -> Adapts:
+    def _adaptation(self, n_envs: int, generator: th.Generator | None) -> Watched:
         """An adaptation to so many tasks, side by side."""
 
-    def start_adaptation(self, n_envs: int, explorer: Any = None, generator: th.Generator | None = None) -> Adapts:
+    def start_adaptation(self, n_envs: int, explorer: Any = None, generator: th.Generator | None = None) -> Watched:
         """
         :param n_envs: number of tasks to adapt to side by side
         :param explorer: None or ``"own"``: it explores in its own way

@@ -10,13 +10,14 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.adaptation import Step
-from sb3_htr.adaptation.loop import Adapts
+from sb3_htr.adaptation.loop import Watched
 from sb3_htr.common.checks import check_numbers
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.rivals.base import Rival, RivalAdaptation
 from sb3_htr.rivals.trials import LastStep, TrialVecEnv
 
 N_EPISODES_PER_TRIAL = 5
+N_TRIALS_PER_BATCH = 4
 # Of an env that is given by its id
 N_ENVS = 20
 
@@ -72,12 +73,12 @@ class TrialAdaptation(RivalAdaptation):
 
 class RL2(Rival, RecurrentPPO):
     """
-    RL2: a recurrent policy that is trained to do well over a whole trial, several episodes on one task, so that it learns to find
-    out in the first ones what the last ones need. Its observation has its last action, the last reward and whether an episode
-    begins in it, see :class:`sb3_htr.rivals.trials.TrialVecEnv`; its memory lives as long as a trial.
+    RL2: a recurrent policy that is trained to do well over a whole trial, several episodes on one task, so that it learns to
+    find out in the first ones what the last ones need. Its observation has its last action, the last reward and whether an
+    episode begins in it, see :class:`sb3_htr.rivals.trials.TrialVecEnv`; its memory lives as long as a trial.
 
-    Papers: https://arxiv.org/abs/1611.02779, https://arxiv.org/abs/1611.05763. The recurrent PPO is sb3-contrib's; a rollout is
-    whole trials. At meta-test, episodes beyond a trial's length repeat its last one, see :class:`TrialAdaptation`.
+    Papers: https://arxiv.org/abs/1611.02779, https://arxiv.org/abs/1611.05763. The recurrent PPO is sb3-contrib's. A rollout
+    is whole trials. At meta-test, episodes beyond a trial's length repeat its last one, see :class:`TrialAdaptation`.
 
     :param policy: ``"MlpLstmPolicy"`` or a class
     :param env: env of a task family, VecEnv of such envs, or registered id
@@ -85,14 +86,14 @@ class RL2(Rival, RecurrentPPO):
         ends
     :param n_trials_per_rollout: trials of each env between two updates
     :param seed: seed of all random generators
-    :param kwargs: arguments of ``RecurrentPPO`` but ``n_steps``, which follows
+    :param kwargs: arguments of ``RecurrentPPO`` but ``n_steps``, which follows. ``batch_size`` is four trials by default
     :raises ValueError: for an env without tasks or time limit, or a number that is out of its range
     """
 
     DEFAULT_POLICY: ClassVar[str] = "MlpLstmPolicy"
     ACTS_BY: ClassVar[tuple[str, ...]] = ("policy_kwargs", "n_episodes_per_trial")
     policy: RecurrentActorCriticPolicy
-    env: TrialVecEnv | None  # type: ignore[assignment]
+    env: TrialVecEnv | None
 
     def __init__(
         self,
@@ -117,9 +118,11 @@ class RL2(Rival, RecurrentPPO):
             assert isinstance(env, TrialVecEnv)
             env.n_episodes = n_episodes_per_trial
             n_steps = n_trials_per_rollout * env.max_trial_steps
+            # Gradients go through a minibatch, in the order of its steps, and no further
+            kwargs.setdefault("batch_size", N_TRIALS_PER_BATCH * env.max_trial_steps)
         self.n_episodes_per_trial = n_episodes_per_trial
         self.n_trials_per_rollout = n_trials_per_rollout
-        super().__init__(policy=policy, env=env, n_steps=n_steps, seed=seed, **kwargs)
+        super().__init__(policy=policy, env=env, n_steps=n_steps, seed=seed, **kwargs)  # type: ignore[arg-type]
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
@@ -149,5 +152,5 @@ class RL2(Rival, RecurrentPPO):
         """
         super().dump_logs(self.num_timesteps // (self.n_steps * self.n_envs))
 
-    def _adaptation(self, n_envs: int, generator: th.Generator | None) -> Adapts:
+    def _adaptation(self, n_envs: int, generator: th.Generator | None) -> Watched:
         return TrialAdaptation(self.policy, n_envs, self.n_episodes_per_trial)

@@ -14,11 +14,11 @@ from stable_baselines3.her import HerReplayBuffer
 from stable_baselines3.sac import SAC
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_htr.adaptation.loop import Adapts
+from sb3_htr.adaptation.loop import Watched
 from sb3_htr.common.checks import check_numbers, check_spaces, get_max_episode_steps, get_task_family
 from sb3_htr.common.type_aliases import TaskFamily, Trajectory
 from sb3_htr.common.vec_env import make_task_vec_env
-from sb3_htr.rivals.base import Rival, RivalAdaptation
+from sb3_htr.rivals.base import Rival, ToldAdaptation
 
 # Of an env that is given by its id
 N_ENVS = 20
@@ -159,40 +159,10 @@ class TaskHerReplayBuffer(HerReplayBuffer):
         }
 
 
-class ToldAdaptation(RivalAdaptation):
-    """
-    No adaptation at all: the agent is told the task.
-
-    :param policy: for the observations of ``shown``
-    :param n_envs: number of tasks
-    :param shown: makes them
-    """
-
-    def __init__(self, policy: SACPolicy, n_envs: int, shown: ShownTask) -> None:
-        super().__init__(n_envs)
-        self.policy = policy
-        self.shown = shown
-
-    def see_tasks(self, tasks: np.ndarray) -> None:
-        """
-        :param tasks: (n_envs, task_dim)
-        """
-        self._tasks = tasks
-
-    def act(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
-        """
-        :param obs: (n_envs, obs_dim)
-        :param deterministic: mean actions instead of samples
-        :return: (n_envs, action_dim), scaled to [-1, 1]
-        """
-        actions, _ = self.policy.predict(self.shown(obs, self._tasks), deterministic=deterministic)
-        return self.policy.scale_action(actions)
-
-
 class SACHER(Rival, SAC):
     """
-    SAC with HER, whose observation has the task in it: how well the family can be solved by an agent that knows its task, of the
-    same library and trained on the same sparse rewards. Papers: https://arxiv.org/abs/1812.05905,
+    SAC with HER, whose observation has the task in it: how well the family can be solved by an agent that knows its task, of
+    the same library and trained on the same sparse rewards. Papers: https://arxiv.org/abs/1812.05905,
     https://arxiv.org/abs/1707.01495.
 
     It takes every family whose tasks are functions of a state: the task that a step achieves must be the same whatever the
@@ -291,5 +261,9 @@ class SACHER(Rival, SAC):
         assert isinstance(self.replay_buffer, TaskHerReplayBuffer)
         self.replay_buffer.load_state_dict(state["replay"])
 
-    def _adaptation(self, n_envs: int, generator: th.Generator | None) -> Adapts:
-        return ToldAdaptation(self.policy, n_envs, self.shown)
+    def _adaptation(self, n_envs: int, generator: th.Generator | None) -> Watched:
+        def act(obs: np.ndarray, tasks: np.ndarray, deterministic: bool) -> np.ndarray:
+            actions, _ = self.policy.predict(self.shown(obs, tasks), deterministic=deterministic)
+            return self.policy.scale_action(actions)
+
+        return ToldAdaptation(n_envs, act)

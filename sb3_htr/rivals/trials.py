@@ -8,6 +8,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_htr.common.checks import check_numbers, check_spaces, get_max_episode_steps, get_task_family
+from sb3_htr.common.vec_env import set_tasks
 from sb3_htr.rivals.base import scaled
 
 
@@ -64,7 +65,7 @@ class TrialVecEnv(VecEnvWrapper):
         assert isinstance(obs, spaces.Box) and isinstance(action, spaces.Box)
         action_dim = action.shape[0]
         low, high = np.append(-np.ones(action_dim), [-np.inf, 0]), np.append(np.ones(action_dim), [np.inf, 1])
-        space = spaces.Box(*(np.append(a, b).astype(np.float32) for a, b in ((obs.low, low), (obs.high, high))))
+        space = spaces.Box(np.append(obs.low, low).astype(np.float32), np.append(obs.high, high).astype(np.float32))
         super().__init__(venv, observation_space=space)
         self.n_episodes = n_episodes
         self._episode = np.zeros(self.num_envs, dtype=np.int64)
@@ -77,22 +78,20 @@ class TrialVecEnv(VecEnvWrapper):
 
     def reset(self) -> VecEnvObs:
         """Begin a trial in each env."""
-        self.venv.env_method("set_task", None)
+        everyone = np.arange(self.num_envs)
+        set_tasks(self.venv, None, everyone)
         obs = self.venv.reset()
         assert isinstance(obs, np.ndarray)
         self._episode[:] = 0
-        self._last.forget(np.arange(self.num_envs))
-        self._arrange(np.arange(self.num_envs))
+        self._last.forget(everyone)
+        self._arrange(everyone)
         return self._last.beside(obs)
 
     def _arrange(self, envs: np.ndarray) -> None:
         """Where an episode has just begun: keep its task for the trial, and in the last one let the env draw the next."""
-        for env in envs:
-            if self._episode[env] == self.n_episodes - 1:
-                self.venv.env_method("set_task", None, indices=int(env))
-            elif self._episode[env] == 0:
-                (task,) = self.venv.get_attr("task_id", indices=int(env))
-                self.venv.env_method("set_task", int(task), indices=int(env))
+        first, last = (envs[self._episode[envs] == episode] for episode in (0, self.n_episodes - 1))
+        set_tasks(self.venv, np.array(self.venv.get_attr("task_id", first.tolist()), dtype=np.int64), first)
+        set_tasks(self.venv, None, last)
 
     def step_async(self, actions: np.ndarray) -> None:
         self._actions = actions
@@ -114,9 +113,10 @@ class TrialVecEnv(VecEnvWrapper):
 
     def _end(self, envs: np.ndarray, obs: np.ndarray, infos: list[dict[str, Any]]) -> None:
         """Trials that are over."""
-        final_obs = obs.copy()
-        final_obs[envs] = [infos[env]["terminal_observation"] for env in envs]
-        final = self._last.beside(final_obs)
+        final = obs.copy()
+        for env in envs:
+            final[env] = infos[env]["terminal_observation"]
+        final = self._last.beside(final)
         for env in envs:
             infos[env] |= {"terminal_observation": final[env], "TimeLimit.truncated": False}
         self._episode[envs] = 0

@@ -38,6 +38,7 @@ EXTRAS = {
     "gymnasium_robotics": "robotics",
     "panda_gym": "panda",
     "metaworld": "metaworld",
+    "sb3_contrib": "zoo",
     "tensorboard": "tensorboard",
     "psycopg": "postgresql",
 }

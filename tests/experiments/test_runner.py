@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from helpers import ENV_ID
+from sb3_htr import PEARL
 from sb3_htr.common.resume import checkpoints
 from sb3_htr.experiments import grid
 from sb3_htr.experiments.grid import Experiment, Variant
@@ -93,6 +94,8 @@ def test_the_command_repeats_an_experiment(
     coarse, plain = (agent_at(cell.run_folder(runs)) for cell in experiment.cells(1, 0.1))
     assert (coarse.method, plain.method) == ("htr-ec", "pearl-sparse-prior")
     assert coarse.record["env_kwargs"] == {"goal_distance": 0.5} and coarse.record["n_timesteps"] == 960
-    relabeller: Any = coarse.load(trust=True).replay_buffer_kwargs["relabeller"]
+    trained = coarse.load(trust=True)
+    assert isinstance(trained, PEARL)
+    relabeller: Any = trained.replay_buffer_kwargs["relabeller"]
     assert relabeller["name"] == "EpisodeClustering" and relabeller["cell_size"] == 0.3
     assert plain.load().explorer.name == "prior"

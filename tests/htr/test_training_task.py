@@ -73,7 +73,8 @@ def test_every_row_has_the_rewards_of_its_training_task(kind: dict[str, Any], se
     assert len(index.rows) == buffer.size(), "everything is relabelled, once"
     task = np.repeat(np.arange(buffer.n_tasks), np.diff(index.task_row))
     rows = relabeller.episodes.rows[index.rows]
-    expected = FAMILY.compute_reward(columns.trajectory(rows[:, None]), FAMILY.train_tasks[task])[:, 0]
+    traj: Any = columns.trajectory(rows[:, None])
+    expected = FAMILY.compute_reward(traj, FAMILY.train_tasks[task])[:, 0]
     np.testing.assert_array_equal(rows[:, columns.reward], expected)
     stored = {row.tobytes() for row in rows[:, [*range(4), columns.reward]]}
     drawn = [np.column_stack([d.observations, d.actions, d.rewards]) for d in (data, data.context)]

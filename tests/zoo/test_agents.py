@@ -153,6 +153,7 @@ def test_normalized_agents_are_exported_with_their_statistics(tmp_path: Path, ti
     make_run(tmp_path / "logs", model)
     assert main(["export", str(tmp_path / "logs"), "-o", str(tmp_path / "agent.zip")]) == 0
     exported = agent_at(tmp_path / "agent.zip").load()
+    assert isinstance(exported, PEARL)
     assert exported.policy.normalizer is not None and exported.policy.normalizer.count > 479
     records = [record_adaptation(agent, ENV_ID, n_episodes=2) for agent in (model, exported)]
     np.testing.assert_array_equal(records[0].achieved, records[1].achieved)

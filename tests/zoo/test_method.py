@@ -17,19 +17,28 @@ from sb3_htr import PEARL
 from sb3_htr.adaptation import Belief, Prior
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run.agents import RECORD, agent_for
-from sb3_htr.zoo.run.method import get_method, merged, methods
+from sb3_htr.zoo.run.method import PEARLMethod, get_method, merged, methods
 
-OWN = ["htr-ser", "htr-ec", "pearl-dense", "pearl-sparse"]
+OWN = ["htr-ser", "htr-ec", "pearl-dense", "pearl-sparse", "htr-hfr", "htr-hipi"]
+OTHERS = ["rl2", "sac-her"]
+
+
+def of_pearl(name: str) -> PEARLMethod:
+    method = get_method(name)
+    assert isinstance(method, PEARLMethod)
+    return method
 
 
 def test_what_the_methods_are() -> None:
-    assert list(methods()) == [*OWN, *(f"{name}-prior" for name in OWN)]
-    relabelling = {name: method.relabel_probability > 0 for name, method in methods().items()}
-    dense = {name for name, method in methods().items() if method.rl_reward_type == "dense"}
-    assert relabelling == {name: name.startswith("htr") for name in methods()}
+    assert list(methods()) == [*OWN, *OTHERS, *(f"{name}-prior" for name in OWN)]
+    pearls = {name: method for name, method in methods().items() if isinstance(method, PEARLMethod)}
+    assert [name for name in methods() if name not in pearls] == OTHERS
+    relabelling = {name: method.relabel_probability > 0 for name, method in pearls.items()}
+    dense = {name for name, method in pearls.items() if method.rl_reward_type == "dense"}
+    assert relabelling == {name: name.startswith("htr") for name in pearls}
     assert dense == {"pearl-dense", "pearl-dense-prior"}
     for name in OWN:
-        method, prior = get_method(name), get_method(f"{name}-prior")
+        method, prior = of_pearl(name), of_pearl(f"{name}-prior")
         assert (method.train_explorer, method.explorer) == ("aggregate", "belief"), "methods differ in one thing at a time"
         assert (prior.train_explorer, prior.explorer) == ("prior", "prior") and "PEARL's protocol" in prior.label
         assert merged(prior.hyperparams(), {key: method.hyperparams()[key] for key in ("explorer", "train_explorer")}) == (
@@ -39,9 +48,9 @@ def test_what_the_methods_are() -> None:
         get_method("htr")
 
 
-@pytest.mark.parametrize("name", methods())
+@pytest.mark.parametrize("name", [*OWN, *(f"{name}-prior" for name in OWN[:4])])
 def test_every_method_trains_as_what_it_says(name: str) -> None:
-    method = get_method(name)
+    method = of_pearl(name)
     model = PEARL("MlpPolicy", ENV_ID, **merged(TINY, method.hyperparams())).learn(480)
     assert model.replay_buffer is not None
     assert type(model.replay_buffer.relabeller).__name__ == method.relabeller

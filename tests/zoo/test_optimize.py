@@ -22,7 +22,7 @@ from sb3_htr import PEARL
 from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.commands import optimize, train
-from sb3_htr.zoo.run.method import get_method, merged, methods
+from sb3_htr.zoo.run.method import PEARLMethod, get_method, merged, methods
 from sb3_htr.zoo.run.search_space import ENCODER_ARCHS, convert_pearl_params, sample_pearl_params
 
 SMALL = ["-params", "n_tasks_per_rollout:4", "n_episodes_per_task:3", "learning_starts:240", "n_envs:4"]
@@ -145,14 +145,16 @@ def test_a_search_that_learnt_nothing_says_so(
     assert len([text for text in said if "existing study" in text]) == 1
 
 
-@pytest.mark.parametrize("name", methods())
+@pytest.mark.parametrize("name", [name for name, method in methods().items() if isinstance(method, PEARLMethod)])
 def test_what_is_sampled_makes_a_model_of_the_method_and_is_what_is_loaded(name: str) -> None:
     study, method = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0)), get_method(name)
+    assert isinstance(method, PEARLMethod)
     relabels = method.relabel_probability > 0
+    how = relabels, "hindsight_task_strategy" in method.relabeller_settings()
     sampled_probabilities = set()
     for _ in range(4):
         trial = study.ask()
-        sampled = sample_pearl_params(trial, relabels)
+        sampled = sample_pearl_params(trial, *how)
         assert sampled == convert_pearl_params(trial.params) and 0.8 <= sampled["gamma"] < 1
         model = PEARL("MlpPolicy", ENV_ID, **merged(method.hyperparams(), sampled))
         assert model.policy.latent_dim == trial.params["latent_dim"]

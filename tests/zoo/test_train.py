@@ -23,7 +23,7 @@ from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback
 from sb3_htr.zoo.run.manager import MetaExperimentManager
 from sb3_htr.zoo.run.memory import keep_freed_memory
-from sb3_htr.zoo.run.method import DEFAULT, get_method, merged
+from sb3_htr.zoo.run.method import DEFAULT, get_method
 from sb3_htr.zoo.run.shipped import hyperparams_file
 
 
@@ -183,7 +183,7 @@ def blocks() -> list[tuple[str, str]]:
 @pytest.mark.parametrize(("file", "block"), blocks())
 def test_every_block_of_hyperparameters_trains(file: str, block: str) -> None:
     settings = yaml.safe_load(hyperparams_file(file).read_text())[block]
-    settings = merged(settings, get_method(settings.pop("method", DEFAULT)).hyperparams())
+    settings = get_method(settings.pop("method", DEFAULT)).settings(settings)
     settings = MetaExperimentManager._preprocess_schedules(settings)
     env = make_task_vec_env(ENV_ID if block == "default" else block, settings.pop("n_envs"))
     del settings["n_timesteps"]

@@ -1,6 +1,5 @@
 """``sb3-htr export``: a small file to share, and what to say about it."""
 
-import inspect
 import json
 import zipfile
 from collections.abc import Sequence
@@ -8,10 +7,11 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from sb3_htr import PEARL
+from stable_baselines3 import SAC
+
 from sb3_htr.adaptation.evaluation import record_adaptation
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.common.checks import get_task_family
+from sb3_htr.common.checks import get_task_family, keywords_of
 from sb3_htr.zoo.commands.arguments import add_agent_arguments, make_parser, parse
 from sb3_htr.zoo.run.agents import RECORD, TrainedAgent
 from sb3_htr.zoo.run.model_card import model_card, training_command
@@ -19,17 +19,17 @@ from sb3_htr.zoo.run.model_card import model_card, training_command
 EXAMPLE = """  sb3-htr export runs/htr-ser/SparsePointRobot-v0_1 -o my_agent
   sb3-htr export runs --film --push-to-hub USER/pearl-SparsePointRobot-v0
   sb3-htr export runs -o agent.zip                                 the file alone"""
-# What a loaded model needs beside the arguments of PEARL
-ALSO_KEPT = ("observation_space", "action_space", "policy_class", "n_envs", "num_timesteps", "_n_updates")
+# What a loaded model needs beside the arguments of its class
+ALSO_KEPT = ("observation_space", "action_space", "policy_class", "n_envs", "num_timesteps", "_n_updates", "shown")
 # Of a run's record, what holds on other machines too
 KEPT_OF_RECORD = ("env_id", "method", "env_kwargs", "gym_packages", "seed", "n_timesteps", "hyperparams", "versions")
 
 
 def export(agent: TrainedAgent, path: Path, trust: bool = False) -> dict[str, Any]:
     """
-    Write a model file without optimizer states, replay, statistics of training and local paths. ``PEARL.load`` reads it, and
-    the commands find in it which env it is for. Actor and encoder are exact; the critics, which acting does not need, are kept
-    in half precision, and their targets are the same as they.
+    Write a model file without optimizer states, replay, statistics of training and local paths. ``load`` of its class reads
+    it, and the commands find in it which env it is for. What acts is exact; critics of SAC, which acting does not need, are
+    kept in half precision, and their targets are the same as they.
 
     :param agent: to export
     :param path: file to write
@@ -41,10 +41,11 @@ def export(agent: TrainedAgent, path: Path, trust: bool = False) -> dict[str, An
         if name.endswith("optimizer"):
             attrgetter(name)(model).state.clear()
     model.verbose = 0
-    model.critic.half()
-    for target, parameter in zip(model.critic_target.parameters(), model.critic.parameters(), strict=True):
-        target.data = parameter.data
-    kept = {*inspect.signature(PEARL.__init__).parameters, *ALSO_KEPT} - {"tensorboard_log"}
+    if isinstance(model, SAC):
+        model.critic.half()
+        for target, parameter in zip(model.critic_target.parameters(), model.critic.parameters(), strict=True):
+            target.data = parameter.data
+    kept = {*keywords_of(type(model)), *ALSO_KEPT} - {"tensorboard_log"}
     record = {key: agent.record[key] for key in KEPT_OF_RECORD if key in agent.record}
     which = "best on the validation tasks" if agent.path.stem == "best_model" else "last"
     record["command"] = training_command(agent.record)
@@ -78,7 +79,7 @@ def push_to_hub(folder: Path, repo_id: str, private: bool = False) -> str:
     api = HfApi()
     try:
         repo = api.create_repo(repo_id, private=private, exist_ok=True)
-        api.upload_folder(repo_id=repo.repo_id, folder_path=folder, commit_message="PEARL agent of sb3_htr")
+        api.upload_folder(repo_id=repo.repo_id, folder_path=folder, commit_message="Agent of sb3_htr")
     except failures as error:
         reason = " ".join(str(error).split())
         raise OSError(f"The upload to {repo_id} failed, the files are in {folder}: {reason}") from error
@@ -108,7 +109,7 @@ def main(argv: Sequence[str]) -> None:
     exported = TrainedAgent(file, record, None)
     model, env = exported.load(), exported.make_vec_env(20)
     tasks = get_task_family(env).test_tasks
-    explorers = dict.fromkeys([model.explorer.name, "prior"])
+    explorers = dict.fromkeys([model.explorer.name, *exported.algorithm.also_explores_by])
     scores = {explorer: record_adaptation(model, env, tasks, args.n_episodes, explorer=explorer) for explorer in explorers}
     with atomic_path(output / "README.md") as temporary:
         temporary.write_text(model_card(record, scores, args.push_to_hub))

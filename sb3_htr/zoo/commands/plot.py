@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import torch as th
 
+from sb3_htr.adaptation.adaptation import Adaptation
 from sb3_htr.adaptation.evaluation import AdaptationRecord, run_adaptation
 from sb3_htr.common.checks import get_task_family
 from sb3_htr.zoo.commands.arguments import add_adaptation_arguments, add_agent_arguments, chosen_agent, make_parser
@@ -24,6 +25,22 @@ PICTURES = ("learning", "adaptation", "paths", "latent")
 FORMATS = ("png", "svg", "pdf")
 
 
+class Latent(NamedTuple):
+    """
+    Where the tasks of some adaptations are in the latent space, of those whose reward was found.
+
+    :param tasks: (n, task_dim)
+    :param mean: (n, latent_dim), posterior means after the last episode
+    :param deviation: (n, latent_dim), their standard deviations
+    :param known_z: (m, latent_dim), z of training tasks
+    """
+
+    tasks: np.ndarray
+    mean: np.ndarray
+    deviation: np.ndarray
+    known_z: np.ndarray
+
+
 class Adapted(NamedTuple):
     """
     Adaptations of one agent to a set of tasks.
@@ -33,10 +50,7 @@ class Adapted(NamedTuple):
     :param start: where all episodes begin, if tasks are points of a plane
     :param explorer: that chose z before the reward was found
     :param record: what happened
-    :param mean: (n_tasks, latent_dim), posterior means after the last episode
-    :param deviation: (n_tasks, latent_dim), their standard deviations
-    :param found: (n_tasks,) bool, whether there is a posterior: the reward of the task was found
-    :param known_z: (m, latent_dim), z of training tasks
+    :param latent: None for an agent that has no latent space
     """
 
     tasks: np.ndarray
@@ -44,10 +58,7 @@ class Adapted(NamedTuple):
     start: np.ndarray | None
     explorer: str
     record: AdaptationRecord
-    mean: np.ndarray
-    deviation: np.ndarray
-    found: np.ndarray
-    known_z: np.ndarray
+    latent: Latent | None
 
 
 def adapt(agent: TrainedAgent, args: argparse.Namespace) -> Adapted:
@@ -65,12 +76,15 @@ def adapt(agent: TrainedAgent, args: argparse.Namespace) -> Adapted:
     env.set_options([{"task": task} for task in tasks])
     adaptation = model.start_adaptation(len(tasks), args.explorer, th.Generator().manual_seed(args.seed))
     record = run_adaptation(model.policy, env, adaptation, args.n_episodes, deterministic=not args.stochastic)
-    particles = model.knowledge.particles()
-    known_z = particles.z[particles.is_train].numpy()
-    radius = getattr(family, "goal_radius", None)
-    explorer = adaptation.explorer.name
+    latent = None
+    if isinstance(adaptation, Adaptation):
+        particles, found = adaptation.knowledge.particles(), ~adaptation.exploring()
+        known_z = particles.z[particles.is_train].numpy()
+        mean, deviation = adaptation.posterior()
+        latent = Latent(tasks[found], mean[found], deviation[found], known_z)
     start = start_position(agent.make_env()) if tasks.shape[1] == 2 else None
-    return Adapted(tasks, radius, start, explorer, record, *adaptation.posterior(), ~adaptation.explorer.exploring(), known_z)
+    explorer = args.explorer or model.explorer.name
+    return Adapted(tasks, getattr(family, "goal_radius", None), start, explorer, record, latent)
 
 
 def groups_of(parser: argparse.ArgumentParser, args: argparse.Namespace) -> dict[str, list[TrainedAgent]]:
@@ -162,7 +176,7 @@ def main(argv: Sequence[str]) -> None:
         learning = {label: curve for label, agents in groups.items() if (curve := learning_curve(label, agents)) is not None}
         labels = ("return of the last adaptation episode", "share of tasks solved (%)")
         if learning:
-            names = [agent.record["hyperparams"]["explorer"]["name"] for agents in groups.values() for agent in agents]
+            names = [agent.explorer for agents in groups.values() for agent in agents]
             about = f"{env_id}, validation tasks, {about_explorers(names)}"
             plot_curves(learning, new("learning_curves"), about, "thousand env steps of meta-training", labels)
         else:
@@ -204,10 +218,12 @@ def plot_adapted(
     if "paths" in args.only and first.tasks.shape[1] == 2:
         title = f"{env_id}, {label}, {args.tasks} tasks, explorer {first.explorer}"
         plot_adaptation_paths(first.record, first.tasks, first.goal_radius, first.start, new("adaptation_paths"), title)
-    found = first.found
-    if "latent" in args.only and found.sum() < 2:
-        print(f"No latent space: {label} found the reward of {found.sum()} of {len(found)} tasks.")
-    elif "latent" in args.only:
-        tasks, posterior = first.tasks[found], (first.mean[found], first.deviation[found])
-        title = f"{env_id}: posteriors of {found.sum()} {args.tasks} tasks"
-        plot_latent_space(tasks, *posterior, first.known_z, new("latent_space"), title)
+    latent = first.latent
+    if "latent" in args.only and latent is None:
+        print(f"No latent space: {label} has none.")
+    elif "latent" in args.only and latent is not None:
+        found = len(latent.tasks)
+        if found < 2:
+            print(f"No latent space: {label} found the reward of {found} of {len(first.tasks)} tasks.")
+        else:
+            plot_latent_space(*latent, new("latent_space"), f"{env_id}: posteriors of {found} {args.tasks} tasks")

@@ -1,4 +1,4 @@
-"""``sb3-htr train``: rl_zoo3's training with PEARL in it, and with evaluations that adapt."""
+"""``sb3-htr train``: rl_zoo3's training with the algorithm of a method in it, and with evaluations that adapt."""
 
 import argparse
 from collections.abc import Sequence
@@ -10,23 +10,24 @@ from sb3_htr.common.resume import n_steps_done
 from sb3_htr.zoo.run.agents import RECORD, file_stem, find_run, read_record
 from sb3_htr.zoo.run.manager import run_rl_zoo
 from sb3_htr.zoo.run.memory import keep_freed_memory
-from sb3_htr.zoo.run.method import get_method
-from sb3_htr.zoo.run.shipped import hyperparams_file
+from sb3_htr.zoo.run.method import DEFAULT, get_method, methods
 from sb3_htr.zoo.run.trust import check_arguments, import_packages
 
 CONF = ("-conf", "--conf-file")
-HELP = """sb3-htr train: rl_zoo3's train (its arguments follow) with PEARL and evaluations that adapt to validation tasks.
+HELP = """sb3-htr train: rl_zoo3's train (its arguments follow) with evaluations that adapt to validation tasks.
 
 examples:
   sb3-htr train --env SparsePointRobot-v0 -P
   sb3-htr train --env SparsePointRobot-v0 --method htr-ec -f runs --seed 1
+  sb3-htr train --env SparsePointRobot-v0 --method rl2
   sb3-htr train --env HiddenGoal/FetchReach-v4
   sb3-htr train --env SparsePointRobot-v0 -params gamma:0.95 "policy_kwargs:{'latent_dim':3}"
   sb3-htr train --resume runs/htr-ser/SparsePointRobot-v0_1
 
-defaults here: --algo pearl -conf hyperparams/pearl.yml (of this package) --num-threads 1 --save-freq 20000
+defaults here: -conf, the YAML file in hyperparams/ of the method's algorithm; --num-threads 1 --save-freq 20000
 beside rl_zoo3's:
-  --method NAME  htr-ser (default), htr-ec, pearl-dense, pearl-sparse; with -prior behind it under PEARL's own protocol
+  --method NAME  htr-ser (default), htr-ec, pearl-dense, pearl-sparse; rivals: htr-hfr, htr-hipi, rl2, sac-her. Those of PEARL
+                 with -prior behind it under PEARL's own protocol
   --resume RUN   go on with a run from its latest checkpoint, exactly; takes no other arguments but those below
                  and -n STEPS: so many more than planned; a learning rate that decays does so anew over what is then planned
   --trust        let files (YAML, the record of a run) import and evaluate what they name
@@ -36,7 +37,7 @@ no effect here: --eval-episodes and --n-eval-envs (an evaluation adapts to each 
 
 def main(argv: Sequence[str]) -> None:
     """
-    :param argv: arguments of rl_zoo3's train; the algorithm is PEARL, the YAML is this package's unless given. Or ``--resume``
+    :param argv: arguments of rl_zoo3's train; the YAML is this package's for the method unless given. Or ``--resume``
         and the folder of a run, which goes on from its latest checkpoint
     """
     parser = argparse.ArgumentParser(prog="sb3-htr train", add_help=False, allow_abbrev=False)
@@ -44,17 +45,19 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--method")
     parser.add_argument("--trust", action="store_true")
     parser.add_argument("--gym-packages", nargs="+", default=[])
-    parser.add_argument("--algo", default="pearl")
+    parser.add_argument("--algo")
     parser.add_argument("--env")
     args, rest = parser.parse_known_args(argv)
     env = [] if args.env is None else ["--env", args.env]
     wants_help = bool({"-h", "--help"} & set(rest))
     if wants_help:
         print(HELP)
-    if args.algo != "pearl":
-        raise ValueError(f"--algo is {args.algo!r}, but sb3-htr trains pearl: `python -m rl_zoo3.train` has SB3's algorithms.")
-    if args.method is not None:
-        get_method(args.method)
+    algorithm = get_method(args.method or DEFAULT).algorithm
+    if args.algo not in (None, algorithm.name):
+        raise ValueError(
+            f"--algo is {args.algo!r}, but sb3-htr trains {algorithm.name}: choose a method, --method {', '.join(methods())}; "
+            "`python -m rl_zoo3.train` has SB3's algorithms."
+        )
     run: Path | None = None
     if args.resume is not None:
         more = argparse.ArgumentParser(prog="sb3-htr train --resume", add_help=False, allow_abbrev=False)
@@ -71,6 +74,7 @@ def main(argv: Sequence[str]) -> None:
             print(f"{run} is finished, after {planned:,} env steps. To train further: sb3-htr train --resume {run} -n STEPS")
             return
         arguments, args.method = [*record["arguments"], "--seed", str(record["seed"])], record["method"]
+        algorithm = get_method(args.method).algorithm
         arguments += ["-n", str(planned)]
         check_arguments(arguments, run / RECORD, args.trust)
         import_packages(args.gym_packages, record["gym_packages"], run / RECORD, args.trust)
@@ -79,7 +83,7 @@ def main(argv: Sequence[str]) -> None:
         if not wants_help and not env:
             raise ValueError("--env is missing: give the id of a task env, as in `sb3-htr train --env SparsePointRobot-v0`.")
         # Later arguments win, so these are defaults. One thread: two runs on two cores must not fight for them.
-        defaults = ["--algo", "pearl", "-conf", str(hyperparams_file()), "--num-threads", "1", "--save-freq", "20000"]
+        defaults = ["--algo", algorithm.name, "-conf", algorithm.settings_file, "--num-threads", "1", "--save-freq", "20000"]
         packages = ["--gym-packages", *args.gym_packages] if args.gym_packages else []
         for before, word in list(pairwise(rest)):
             if before in CONF and Path(word).exists():
@@ -89,7 +93,7 @@ def main(argv: Sequence[str]) -> None:
         find_hidden(args.env or "")
     keep_freed_memory()
     try:
-        run_rl_zoo("sb3-htr train", arguments, args.method, run, args.trust)
+        run_rl_zoo("sb3-htr train", algorithm, arguments, args.method, run, args.trust)
     except (NameError, SyntaxError) as error:
         raise ValueError(
             f"{error}: the values of -params and --env-kwargs are Python, with strings in quotes, as in \"explorer:'prior'\"."

@@ -14,9 +14,9 @@ from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv
 
 import htr_envs  # noqa: F401 registers the envs
-from sb3_htr import PEARL, load_untrusted
 from sb3_htr.common.vec_env import make_task_vec_env
-from sb3_htr.zoo.run.method import get_method, methods
+from sb3_htr.zoo.run.algorithm import Algorithm, Model
+from sb3_htr.zoo.run.method import DEFAULT, OWN, get_method, methods
 from sb3_htr.zoo.run.shipped import shipped
 
 # Record of a run: in its folder, and in an exported model file
@@ -55,10 +55,21 @@ class TrainedAgent:
         """How a picture calls it: the run folder or the file."""
         return self.folder.name if self.folder is not None else f"{self.path.parent.name}/{self.path.stem}"
 
-    def load(self, device: str = "cpu", trust: bool = False) -> PEARL:
+    @property
+    def algorithm(self) -> Algorithm:
+        """What trained it; PEARL if that is not said."""
+        return methods().get(self.method, get_method(DEFAULT)).algorithm
+
+    @property
+    def explorer(self) -> str:
+        """Name of the explorer that it was evaluated with in its training."""
+        explorer = self.record.get("hyperparams", {}).get("explorer", {"name": OWN})
+        return str(explorer["name"])
+
+    def load(self, device: str = "cpu", trust: bool = False) -> Model:
         """
         :param device: torch device
-        :param trust: unpickle all of the file, as ``PEARL.load`` does, which can run any code; needed for networks and
+        :param trust: unpickle all of the file, as ``load`` of the class does, which can run any code; needed for networks and
             explorers of one's own
         :return: the model
         :raises ValueError: for a device that cannot be used, or a model whose networks are not those of this version
@@ -68,9 +79,7 @@ class TrainedAgent:
         except (RuntimeError, AssertionError, NotImplementedError):
             raise ValueError(f"The device {device!r} cannot be used: give cpu, cuda or cuda:N.") from None
         try:
-            if trust:
-                return PEARL.load(self.path, device=device)
-            return load_untrusted(self.path, self.make_env(), device)
+            return self.algorithm.load(self.path, self.record, self.make_env(), device, trust)
         except RuntimeError as error:
             writer = self.record.get("versions", {}).get("sb3_htr", "unknown")
             reason = str(error).splitlines()[-1].strip()[:200]
@@ -191,7 +200,7 @@ def agent_at(path: str | os.PathLike[str], which: str = "best", env_id: str | No
         if RECORD in names:
             return TrainedAgent(path, read_record(path, archive.read(RECORD)), None)
     if "data" not in names:
-        raise ValueError(f"{path} is no model file: give a run folder, or a .zip saved by PEARL.")
+        raise ValueError(f"{path} is no model file: give a run folder, or a .zip that a training has saved.")
     if (path.parent / RECORD).exists():
         return TrainedAgent(path, read_record(path.parent / RECORD), path.parent)
     if env_id is None:

@@ -2,13 +2,12 @@
 
 import importlib
 import json
-import os
 import zipfile
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import torch as th
 from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_htr.pearl import PEARL, load_untrusted
@@ -28,14 +27,16 @@ class Algorithm:
     :param module: that its class is in, imported when it is needed
     :param class_name: of the class
     :param settings: YAML file with its hyperparameters
-    :param has_explorers: whether it has explorers, and is searched for hyperparameters
+    :param about: how an agent of it comes to know its task, for model cards
+    :param also_explores_by: explorer that scores name beside its own
     """
 
     name: str
     module: str
     class_name: str
     settings: str
-    has_explorers: bool = False
+    about: str
+    also_explores_by: tuple[str, ...] = ()
 
     @property
     def settings_file(self) -> str:
@@ -50,7 +51,7 @@ class Algorithm:
         model_class: type[Any] = getattr(importlib.import_module(self.module), self.class_name)
         return model_class
 
-    def load(self, path: str | os.PathLike[str], record: dict[str, Any], env: gym.Env, device: str, trust: bool) -> Model:
+    def load(self, path: Path, record: dict[str, Any], env: gym.Env, device: str, trust: bool) -> Model:
         """
         :param path: model file
         :param record: of its training
@@ -62,7 +63,7 @@ class Algorithm:
         """
         model_class = self.model_class()
         if trust:
-            return model_class.load(path, device=device)  # type: ignore[no-any-return]
+            return model_class.load(path, device=device)
         if model_class is PEARL:
             return load_untrusted(path, env, device)
         # A new model with the plain settings of the record, and the weights of the file
@@ -77,7 +78,7 @@ class Algorithm:
             _, weights, _ = load_from_zip_file(path, load_data=False, device=model.device)
             model.set_parameters({"policy": weights["policy"]}, exact_match=False, device=model.device)
         except (KeyError, RuntimeError, AttributeError, zipfile.BadZipFile, json.JSONDecodeError) as error:
-            raise ValueError(f"{path} is damaged, or no model of {self.name} with the settings of its record: {error}") from None
+            raise ValueError(f"{path} is damaged, or no {self.name} model with the settings of its record: {error}") from None
         model.num_timesteps = n_steps if type(n_steps) is int else 0
         return model
 
@@ -85,10 +86,27 @@ class Algorithm:
 ALGORITHMS = {
     algorithm.name: algorithm
     for algorithm in (
-        Algorithm("pearl", "sb3_htr.pearl", "PEARL", "pearl.yml", has_explorers=True),
-        Algorithm("rl2", "sb3_htr.rivals.rl2", "RL2", "rl2.yml"),
-        Algorithm("sac-her", "sb3_htr.rivals.sac_her", "SACHER", "sac_her.yml"),
-        Algorithm("random", "sb3_htr.rivals.untrained", "RandomAgent", "untrained.yml"),
-        Algorithm("scripted", "sb3_htr.rivals.untrained", "ScriptedAgent", "untrained.yml"),
+        Algorithm(
+            "pearl",
+            "sb3_htr.pearl",
+            "PEARL",
+            "pearl.yml",
+            "It is not told its task: it tries a few episodes, infers the task from sparse rewards, and then solves it.",
+            also_explores_by=("prior",),
+        ),
+        Algorithm(
+            "rl2",
+            "sb3_htr.rivals.rl2",
+            "RL2",
+            "rl2.yml",
+            "It is not told its task: it tries a few episodes, and its memory has what it found there.",
+        ),
+        Algorithm(
+            "sac-her",
+            "sb3_htr.rivals.sac_her",
+            "SACHER",
+            "sac_her.yml",
+            "It is told its task, which makes it a ceiling for agents that are not.",
+        ),
     )
 }

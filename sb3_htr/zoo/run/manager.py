@@ -14,7 +14,7 @@ from io import StringIO
 from pathlib import Path
 from pprint import pprint
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 import optuna
 import rl_zoo3.train
@@ -28,7 +28,6 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 import htr_envs  # noqa: F401 registers the envs
-from sb3_htr import PEARL
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
 from sb3_htr.common.atomic import WRITE_ERRORS, atomic_path, reason
 from sb3_htr.common.checks import check_keywords, check_numbers
@@ -38,13 +37,14 @@ from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.common.versions import commit, versions
 from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.zoo.run.agents import RECORD, read_record
+from sb3_htr.zoo.run.algorithm import Algorithm
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback, ProgressCallback
 from sb3_htr.zoo.run.folder import claim, lock
-from sb3_htr.zoo.run.method import DEFAULT, get_method, merged
+from sb3_htr.zoo.run.method import DEFAULT, PEARLMethod, get_method, merged
 from sb3_htr.zoo.run.search_space import convert_pearl_params, sample_pearl_params
 from sb3_htr.zoo.run.trust import plain_settings
 
-# What a YAML file may have beside the arguments of PEARL
+# What a YAML file may have beside the arguments of the algorithm
 ZOO_SETTINGS = ("n_envs", "n_timesteps", "env_wrapper", "vec_env_wrapper", "callback", "env_kwargs")
 # Tasks that an evaluation adapts to side by side
 N_EVAL_ENVS = 20
@@ -80,7 +80,11 @@ class MetaExperimentManager(ExperimentManager):
         in_file = hyperparams.pop("method", DEFAULT)
         in_params = given.pop("method", in_file)
         self.method = get_method(self._method_name or in_params)
-        hyperparams = merged(plain_settings(hyperparams, self.config, self.trust), self.method.hyperparams())
+        if self.method.algorithm.name != self.algo:
+            raise ValueError(f"{self.method.name} is trained by another algorithm: choose it by --method {self.method.name}.")
+        if self.optimize_hyperparameters and not isinstance(self.method, PEARLMethod):
+            raise ValueError(f"The search is for settings of PEARL, and {self.method.name} has none: choose another --method.")
+        hyperparams = self.method.settings(plain_settings(hyperparams, self.config, self.trust))
         hyperparams = merged(merged(hyperparams, self._trial(trial_id)), given)
         saved = OrderedDict(sorted(hyperparams.items()))
         print(f"Method {self.method.name}: {self.config} has the settings of the env. With those of the command line:")
@@ -107,7 +111,8 @@ class MetaExperimentManager(ExperimentManager):
                 "normalize asks for SB3's VecNormalize, which is not saved with the model: write policy_kwargs: "
                 "{normalize_observations: true} in its place."
             )
-        check_keywords("PEARL", hyperparams, PEARL, also=ZOO_SETTINGS)
+        model_class = self.method.algorithm.model_class()
+        check_keywords(model_class.__name__, hyperparams, model_class, also=ZOO_SETTINGS)
         check_numbers(n_envs=(hyperparams.get("n_envs", 1), 1, float("inf")))
         processed = super()._preprocess_hyperparams(hyperparams)
         if self._eval_env_kwargs_args is None:
@@ -179,16 +184,16 @@ class MetaExperimentManager(ExperimentManager):
 
         :param model: as set up
         """
-        assert isinstance(model, PEARL)
         done = 0
         if self.resumed is not None:
             assert self._checkpointing is not None, "a run that has a checkpoint makes them"
-            self._checkpointing.restore(model, self._checkpoint)
+            self._checkpointing.restore(cast(Any, model), self._checkpoint)
             done = model.num_timesteps
         log_interval = {-1: 1}.get(self.log_interval, self.log_interval if self.log_interval > 0 else None)
         with _soft_interrupt(self._checkpointing):
             try:
-                model.learn(max(int(self.n_timesteps) - done, 0), self.callbacks, log_interval, reset_num_timesteps=not done)
+                n_steps = max(int(self.n_timesteps) - done, 0)
+                model.learn(n_steps, self.callbacks, log_interval, reset_num_timesteps=not done)  # type: ignore[arg-type]
             except KeyboardInterrupt:
                 print(f"Interrupted at {model.num_timesteps} steps.")
             except DivergedError as error:
@@ -222,8 +227,9 @@ class MetaExperimentManager(ExperimentManager):
         :raises optuna.TrialPruned: for hyperparameters that promise little or diverge
         """
         try:
-            relabels = self.method.relabel_probability > 0
-            HYPERPARAMS_SAMPLER[self.algo] = lambda trial, *_: merged(self._hyperparams, sample_pearl_params(trial, relabels))
+            assert isinstance(self.method, PEARLMethod)
+            how = self.method.relabel_probability > 0, "hindsight_task_strategy" in self.method.relabeller_settings()
+            HYPERPARAMS_SAMPLER[self.algo] = lambda trial, *_: merged(self._hyperparams, sample_pearl_params(trial, *how))
             return super().objective(trial)
         except DivergedError as error:
             print(f"Trial {trial.number} is pruned: {error}")
@@ -287,18 +293,24 @@ def _soft_interrupt(checkpointing: CheckpointCallback | None) -> Iterator[None]:
 
 
 def run_rl_zoo(
-    program: str, arguments: list[str], method: str | None = None, resumed: Path | None = None, trust: bool = False
+    program: str,
+    algorithm: Algorithm,
+    arguments: list[str],
+    method: str | None = None,
+    resumed: Path | None = None,
+    trust: bool = False,
 ) -> None:
     """
-    rl_zoo3's train with PEARL in it.
+    rl_zoo3's train with one of our algorithms in it.
 
     :param program: name for its messages
+    :param algorithm: the one that ``--algo`` names
     :param arguments: for it
     :param method: name of the method; that of the YAML file by default
     :param resumed: folder of the run that goes on, None for a new one
     :param trust: whether files may have code run
     """
-    ALGOS["pearl"] = PEARL
+    ALGOS[algorithm.name] = algorithm.model_class()
     HYPERPARAMS_CONVERTER["pearl"] = convert_pearl_params
     manager = partial(MetaExperimentManager, method=method, resumed=resumed, trust=trust)
     # rl_zoo3 looks these names up when it needs them

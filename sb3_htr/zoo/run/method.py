@@ -8,13 +8,14 @@ import yaml
 
 from sb3_htr.common.checks import keywords_of
 from sb3_htr.htr.relabel import RELABELLERS
+from sb3_htr.rivals.base import OwnWay
 from sb3_htr.zoo.run.algorithm import ALGORITHMS, Algorithm
 from sb3_htr.zoo.run.shipped import hyperparams_file
 
 DEFAULT = "htr-ser"
 PRIOR = "-prior"
 # In place of an explorer's name, for agents that explore in a way of their own
-OWN = "own"
+OWN = OwnWay.name
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,8 @@ from huggingface_hub import EvalResult, ModelCardData
 
 from sb3_htr.adaptation.evaluation import AdaptationRecord
 from sb3_htr.zoo.run.agents import file_stem
+from sb3_htr.zoo.run.algorithm import Algorithm
+from sb3_htr.zoo.run.method import DEFAULT, get_method, methods
 
 TAGS = (
     "deep-reinforcement-learning",
@@ -19,6 +21,9 @@ TAGS = (
 )
 # Adaptation episodes in the table, and the last one
 SHOWN = (1, 2, 3, 5, 10)
+PEARL = "PEARL (Rakelly et al., 2019)"
+OF_EXPLORERS = """ The explorer says how z is chosen before the first reward;
+`prior` is the protocol of PEARL's paper."""
 # Arguments of a training that change nothing of its result, with the number of their values
 LOCAL = {"-f": 1, "--log-folder": 1, "-tb": 1, "--tensorboard-log": 1, "-P": 0, "--progress": 0, "--verbose": 1, "--seed": 1}
 
@@ -32,7 +37,7 @@ def training_command(record: dict[str, Any]) -> str:
         return str(record.get("command", "unknown"))
     arguments = list(record["arguments"])
     # What `sb3-htr train` puts in front: --algo, -conf, --num-threads, --save-freq
-    if arguments[:2] == ["--algo", "pearl"] and arguments[2:3] == ["-conf"]:
+    if arguments[:1] == ["--algo"] and arguments[2:3] == ["-conf"]:
         arguments = arguments[8:]
     arguments += ["--method", record["method"]]
     words: list[str] = []
@@ -60,6 +65,33 @@ def table(scores: dict[str, AdaptationRecord]) -> str:
             cells += [f"{returns.mean():.2f} ± {returns.std():.2f}", f"{record.successes[:, i - 1].mean():.0%}"]
         lines.append(cells)
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def snippet(algorithm: Algorithm, path: str, env: str, n_episodes: int) -> str:
+    """
+    :param algorithm: of the agent
+    :param path: of its file, in Python
+    :param env: makes an env, in Python
+    :param n_episodes: of an adaptation
+    :return: Python that loads the agent and lets it adapt to a task
+    """
+    name = algorithm.class_name
+    if hasattr(algorithm.model_class(), "adapt"):
+        return f"""from sb3_htr import {name}
+
+model = {name}.load({path})
+env = {env}
+agent = model.adapt(env, n_episodes={n_episodes}, task=env.unwrapped.test_tasks[0])
+print(agent.returns)  # of the adaptation episodes; agent.predict(observation) acts on this task
+"""
+    return f"""from sb3_htr import evaluate_adaptation
+from {algorithm.module} import {name}
+
+model = {name}.load({path})
+env = {env}
+returns, successes = evaluate_adaptation(model, env, env.unwrapped.test_tasks[:1], n_episodes={n_episodes})
+print(returns)  # of the episodes
+"""
 
 
 def model_card(record: dict[str, Any], scores: dict[str, AdaptationRecord], repo_id: str | None = None) -> str:
@@ -94,7 +126,12 @@ def model_card(record: dict[str, Any], scores: dict[str, AdaptationRecord], repo
     if repo_id is not None:
         imports += "from huggingface_hub import hf_hub_download\n"
         path = f'hf_hub_download("{repo_id}", {path})'
-    about = " with Hindsight Task Relabelling (Packer, Abbeel and Gonzalez, 2021)" if name.startswith("htr") else ""
+    # A method of another version says no more than its name
+    method = methods().get(name)
+    about = PEARL if method is None else method.about
+    algorithm = (method or get_method(DEFAULT)).algorithm
+    use = snippet(algorithm, path, f'gymnasium.make("{env_id}"{kwargs})', min(n_episodes, 10))
+    of_explorers = OF_EXPLORERS if algorithm.also_explores_by else ""
     versions = ", ".join(f"{package} {version}" for package, version in record.get("versions", {}).items())
     return f"""---
 {data.to_yaml()}
@@ -102,14 +139,12 @@ def model_card(record: dict[str, Any], scores: dict[str, AdaptationRecord], repo
 
 # {name} on {env_id}
 
-An agent that adapts: PEARL (Rakelly et al., 2019){about}, trained with `sb3_htr` on
-Stable-Baselines3. It is not told its task: it tries a few episodes, infers the task from sparse rewards, and then solves it.
+An agent of {about}, trained with `sb3_htr` on Stable-Baselines3. {algorithm.about}
 
 ## Scores
 
 Undiscounted return (mean ± standard deviation over tasks) and share of tasks solved, on {n_tasks} test tasks that training
-has not seen, with mean actions. The explorer says how z is chosen before the first reward; `prior` is the protocol of PEARL's
-paper.
+has not seen, with mean actions.{of_explorers}
 
 {table(scores)}
 
@@ -123,16 +158,9 @@ $ sb3-htr enjoy {file}
 ```python
 import gymnasium
 
-{imports}from sb3_htr import PEARL
+{imports}{use}```
 
-model = PEARL.load({path})
-env = gymnasium.make("{env_id}"{kwargs})
-agent = model.adapt(env, n_episodes={min(n_episodes, 10)}, task=env.unwrapped.test_tasks[0])
-print(agent.returns)  # of the adaptation episodes; agent.predict(observation) acts on this task
-```
-
-`predict` of the model itself acts without knowing any task. A model file can run code when it is loaded;
-`sb3_htr.load_untrusted(path, env)` reads the weights and plain settings alone.
+A model file can run code when it is loaded like this. The commands of `sb3-htr` read the weights and plain settings alone.
 
 ## Training
 

@@ -15,10 +15,11 @@ STRATEGIES = [strategy.value for strategy in HindsightTaskStrategy]
 ENCODER_ARCHS = {"small": [64, 64], "medium": [128, 128], "paper": [200, 200, 200]}
 
 
-def sample_pearl_params(trial: "optuna.Trial", relabels: bool = True) -> dict[str, Any]:
+def sample_pearl_params(trial: "optuna.Trial", relabels: bool = True, chooses_states: bool = True) -> dict[str, Any]:
     """
     :param trial: draws the values
-    :param relabels: whether the method relabels; how often and how it does is sampled then
+    :param relabels: whether the method relabels; how often it does is sampled then
+    :param chooses_states: whether its hindsight tasks are states that an episode reached; which ones is sampled then
     :return: arguments of PEARL
     """
     params: dict[str, Any] = {
@@ -37,6 +38,7 @@ def sample_pearl_params(trial: "optuna.Trial", relabels: bool = True) -> dict[st
     }
     if relabels:
         params["relabel_probability"] = trial.suggest_categorical("relabel_probability", RELABEL_PROBABILITIES)
+    if relabels and chooses_states:
         params["hindsight_task_strategy"] = trial.suggest_categorical("hindsight_task_strategy", STRATEGIES)
     return convert_pearl_params(params)
 
@@ -56,8 +58,7 @@ def convert_pearl_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
         "encoder_arch": ENCODER_ARCHS[params.pop("encoder_arch")],
     }
     if "relabel_probability" in params:
-        converted["replay_buffer_kwargs"] = {
-            "relabel_probability": params.pop("relabel_probability"),
-            "relabeller": {"hindsight_task_strategy": params.pop("hindsight_task_strategy")},
-        }
+        converted["replay_buffer_kwargs"] = {"relabel_probability": params.pop("relabel_probability")}
+    if "hindsight_task_strategy" in params:
+        converted["replay_buffer_kwargs"]["relabeller"] = {"hindsight_task_strategy": params.pop("hindsight_task_strategy")}
     return {**converted, **params}

@@ -1,0 +1,60 @@
+"""Agents that nobody trained: random actions are the floor, a script that is told the task is a ceiling."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+
+from sb3_htr.rivals.base import OwnWay, ToldAdaptation
+
+# Observations (n, obs_dim) and tasks (n, task_dim) to actions (n, action_dim), scaled to [-1, 1]
+Script = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+class ScriptedAgent:
+    """
+    Is evaluated as a trained one is, by :func:`sb3_htr.evaluate_adaptation`.
+
+    :param action_space: Box
+    :param script: observations (n, obs_dim) and the tasks to solve (n, task_dim) to actions (n, action_dim), scaled to [-1, 1]
+    """
+
+    explorer = OwnWay()
+
+    def __init__(self, action_space: spaces.Box, script: Script) -> None:
+        self.action_space = action_space
+        self.script = script
+
+    @classmethod
+    def random(cls, action_space: spaces.Box, seed: int = 0) -> "ScriptedAgent":
+        """
+        :param action_space: Box
+        :param seed: of the actions
+        :return: an agent whose actions are uniformly random, whatever the task
+        """
+        rng, shape = np.random.default_rng(seed), action_space.shape
+        return cls(action_space, lambda obs, tasks: rng.uniform(-1, 1, (len(obs), *shape)).astype(np.float32))
+
+    @property
+    def policy(self) -> "ScriptedAgent":
+        """What knows the action space."""
+        return self
+
+    def unscale_action(self, actions: np.ndarray) -> np.ndarray:
+        """
+        :param actions: (n, action_dim), scaled to [-1, 1]
+        :return: the same, in the bounds of the action space
+        """
+        low, high = self.action_space.low, self.action_space.high
+        return np.asarray(low + 0.5 * (actions + 1.0) * (high - low), dtype=np.float32)
+
+    def start_adaptation(self, n_envs: int, explorer: Any = None, generator: th.Generator | None = None) -> ToldAdaptation:
+        """
+        :param n_envs: number of tasks
+        :param explorer: not used
+        :param generator: not used
+        :return: acts by the script
+        """
+        return ToldAdaptation(n_envs, lambda obs, tasks, deterministic: self.script(obs, tasks))
