@@ -180,6 +180,7 @@ class SACHER(Rival, SAC):
     """
 
     DEFAULT_POLICY: ClassVar[str] = "MultiInputPolicy"
+    ACTS_WITH: ClassVar[dict[str, Any]] = {"buffer_size": 1}
 
     def __init__(
         self,

@@ -44,7 +44,7 @@ def test_what_the_methods_are() -> None:
         assert merged(prior.hyperparams(), {key: method.hyperparams()[key] for key in ("explorer", "train_explorer")}) == (
             method.hyperparams()
         )
-    with pytest.raises(ValueError, match=r"The method is 'htr', expected one of htr-ser, htr-ec, .*pearl-sparse-prior\."):
+    with pytest.raises(ValueError, match=r"The method is 'htr', expected one of htr-ser, htr-ec, .*htr-hipi-prior\."):
         get_method("htr")
 
 

@@ -68,7 +68,7 @@ class Algorithm:
             return load_untrusted(path, env, device)
         # A new model with the plain settings of the record, and the weights of the file
         given = record.get("hyperparams", {})
-        settings = {name: given[name] for name in model_class.ACTS_BY if name in given}
+        settings = {name: given[name] for name in model_class.ACTS_BY if name in given} | model_class.ACTS_WITH
         try:
             with zipfile.ZipFile(path) as archive:
                 if sum(info.file_size for info in archive.infolist()) > MAX_BYTES:
@@ -76,8 +76,8 @@ class Algorithm:
                 n_steps = json.loads(archive.read("data")).get("num_timesteps", 0)
             model: Rival = model_class(given.get("policy", model_class.DEFAULT_POLICY), env, device=device, **settings)
             _, weights, _ = load_from_zip_file(path, load_data=False, device=model.device)
-            model.set_parameters({"policy": weights["policy"]}, exact_match=False, device=model.device)
-        except (KeyError, RuntimeError, AttributeError, zipfile.BadZipFile, json.JSONDecodeError) as error:
+            model.policy.load_state_dict(weights["policy"])
+        except (KeyError, TypeError, AssertionError, AttributeError, RuntimeError, ValueError, zipfile.BadZipFile) as error:
             raise ValueError(f"{path} is damaged, or no {self.name} model with the settings of its record: {error}") from None
         model.num_timesteps = n_steps if type(n_steps) is int else 0
         return model

@@ -1,0 +1,41 @@
+"""A training that goes on from a checkpoint is the one that was never interrupted."""
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch as th
+
+from helpers import ENV_ID
+from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.rivals.rl2 import RL2
+from sb3_htr.rivals.sac_her import SACHER
+
+# Env steps of a rollout
+ROLLOUT = 2 * 40
+
+
+def rl2() -> RL2:
+    nets = {"lstm_hidden_size": 4, "net_arch": [4]}
+    env = make_task_vec_env(ENV_ID, 2, seed=0)
+    return RL2("MlpLstmPolicy", env, 2, n_trials_per_rollout=1, n_epochs=1, seed=0, policy_kwargs=nets)
+
+
+def sac_her() -> SACHER:
+    env = make_task_vec_env(ENV_ID, 4, seed=0)
+    # The buffer is full and begins anew within the run
+    return SACHER("MultiInputPolicy", env, 2, seed=0, policy_kwargs={"net_arch": [4]}, learning_starts=0, buffer_size=200)
+
+
+@pytest.mark.parametrize("make", [rl2, sac_her])
+def test_it_goes_on_exactly(make: Callable[[], Any]) -> None:
+    # One at a time: they share the global generators
+    unbroken = make().learn(4 * ROLLOUT)
+    state = copy.deepcopy(make().learn(2 * ROLLOUT).state_dict())
+    second = make()
+    second.load_state_dict(state)
+    second.learn(2 * ROLLOUT, reset_num_timesteps=False)
+    assert second.num_timesteps == unbroken.num_timesteps and second._n_updates == unbroken._n_updates
+    for name, value in unbroken.policy.state_dict().items():
+        assert th.equal(value, second.policy.state_dict()[name]), name

@@ -1,0 +1,132 @@
+"""RL2: trials, the memory of them, and what every rival does."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from helpers import ENV_ID
+from sb3_htr import evaluate_adaptation
+from sb3_htr.adaptation.adaptation import Step
+from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.rivals.rl2 import RL2, TrialAdaptation
+from sb3_htr.rivals.trials import TrialVecEnv
+
+N_STEPS = 20
+vec_envs = pytest.mark.parametrize("vec_env_class", [None, DummyVecEnv], ids=["batched", "single"])
+
+
+def tiny_rl2(env: Any = None, **kwargs: Any) -> RL2:
+    """An RL2 that trains in a moment, 80 steps a rollout."""
+    env = make_task_vec_env(ENV_ID, 2, seed=0) if env is None else env
+    settings = {"n_episodes_per_trial": 2, "n_trials_per_rollout": 1, "n_epochs": 1, "seed": 0}
+    settings["policy_kwargs"] = {"lstm_hidden_size": 4, "net_arch": [4]}
+    return RL2("MlpLstmPolicy", env, **{**settings, **kwargs})
+
+
+@vec_envs
+def test_a_trial_is_several_episodes_on_one_task(vec_env_class: Any) -> None:
+    inner = make_task_vec_env(ENV_ID, 3, seed=0, vec_env_class=vec_env_class)
+    env, rng = TrialVecEnv(inner, n_episodes=2), np.random.default_rng(0)
+    obs = env.reset()
+    assert isinstance(obs, np.ndarray) and obs.shape == (3, 2 + 2 + 1 + 1)
+    np.testing.assert_array_equal(obs[:, 2:], [[0, 0, 0, 1]] * 3)
+    tasks, all_dones = [], []
+    for step in range(1, 4 * N_STEPS + 1):
+        actions = rng.uniform(-1, 1, (3, 2)).astype(np.float32)
+        tasks.append(inner.get_attr("task_id"))
+        obs, rewards, dones, infos = env.step(actions)
+        assert isinstance(obs, np.ndarray)
+        all_dones.append(dones)
+        seen = np.stack([info["terminal_observation"] for info in infos]) if dones.any() else obs
+        np.testing.assert_allclose(seen[:, 2:4], actions, atol=1e-6)
+        np.testing.assert_allclose(seen[:, 4], rewards)
+        assert (seen[:, 5] == (step % N_STEPS == 0)).all(), "whether an episode begins"
+        if dones.any():
+            np.testing.assert_array_equal(obs[:, 2:], [[0, 0, 0, 1]] * 3)
+            assert not any(info["TimeLimit.truncated"] for info in infos), "what follows is another trial"
+    assert np.flatnonzero(np.any(all_dones, axis=1)).tolist() == [2 * N_STEPS - 1, 4 * N_STEPS - 1]
+    first, second = np.array(tasks[: 2 * N_STEPS]), np.array(tasks[2 * N_STEPS :])
+    assert (first == first[0]).all() and (second == second[0]).all() and (first[0] != second[0]).any()
+
+
+def test_the_policy_sees_at_meta_test_what_it_saw_in_training() -> None:
+    model = tiny_rl2()
+    trials, plain = (make_task_vec_env(ENV_ID, 2, seed=0, env_kwargs={"goal_distance": 0.2}) for _ in range(2))
+    trial_env = TrialVecEnv(trials, n_episodes=2)
+    expected, obs = trial_env.reset(), plain.reset()
+    plain.set_options([{"task_id": task} for task in trials.get_attr("task_id")])
+    obs = plain.reset()
+    adaptation = TrialAdaptation(model.policy, 2, n_episodes_per_trial=2)
+    state: Any = None
+    begins = np.ones(2, dtype=bool)
+    for step in range(2 * N_STEPS):
+        assert isinstance(obs, np.ndarray) and isinstance(expected, np.ndarray)
+        if step:
+            np.testing.assert_allclose(adaptation._last.beside(obs), expected, atol=1e-6)
+        in_training, state = model.policy.predict(expected, state, begins, deterministic=True)
+        actions = adaptation.act(obs)
+        np.testing.assert_allclose(model.policy.unscale_action(actions), in_training, atol=1e-5)
+        expected, _, _, _ = trial_env.step(in_training)
+        next_obs, rewards, dones, infos = plain.step(in_training)
+        adaptation.observe(Step(obs, actions, rewards, next_obs, dones, infos))  # type: ignore[arg-type]
+        obs, begins = next_obs, np.zeros(2, dtype=bool)
+
+
+def test_episodes_beyond_a_trial_repeat_its_last_one() -> None:
+    adaptation, rng = TrialAdaptation(tiny_rl2().policy, 2, n_episodes_per_trial=2), np.random.default_rng(0)
+    memories = []
+    for step in range(5 * 3):
+        if step % 3 == 0:
+            memories.append((adaptation._memory.copy(), adaptation._last.columns.copy()))
+        obs = rng.normal(size=(2, 2)).astype(np.float32)
+        actions = adaptation.act(obs)
+        dones = np.full(2, step % 3 == 2)
+        adaptation.observe(Step(obs, actions, rng.normal(size=2), obs, dones, [{"is_success": False}] * 2))
+    for memory, last in memories[2:]:
+        np.testing.assert_array_equal(memory, memories[1][0])
+        np.testing.assert_array_equal(last, memories[1][1])
+    assert not np.allclose(memories[0][0], memories[1][0])
+
+
+def test_it_learns_and_is_the_same_after_save_and_load(tmp_path: Any) -> None:
+    model = tiny_rl2()
+    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
+    model.learn(160)
+    assert any(not th.equal(value, before[name]) for name, value in model.policy.state_dict().items())
+    model.save(tmp_path / "model")
+    loaded = RL2.load(tmp_path / "model")
+    assert loaded.n_episodes_per_trial == 2
+    (ours, _), (theirs, _) = (evaluate_adaptation(agent, ENV_ID, n_episodes=3, seed=4) for agent in (model, loaded))
+    np.testing.assert_array_equal(ours, theirs)
+    loaded.set_env(make_task_vec_env(ENV_ID, 2))
+    loaded.learn(80, reset_num_timesteps=False)
+    assert loaded.num_timesteps == 240
+
+
+def test_a_rollout_is_whole_trials_and_a_minibatch_some_of_them() -> None:
+    model = tiny_rl2(n_episodes_per_trial=3, n_trials_per_rollout=2)
+    assert model.n_steps == 2 * 3 * N_STEPS and model.batch_size == 4 * 3 * N_STEPS
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"n_episodes_per_trial": 0}, "n_episodes_per_trial is 0, expected a whole number of at least 1"),
+        ({"n_trials_per_rollout": 0}, "n_trials_per_rollout is 0, expected a whole number of at least 1"),
+        ({"n_steps": 128}, "n_steps follows from n_trials_per_rollout"),
+        ({"env": "Pendulum-v1"}, "no task_family"),
+    ],
+)
+def test_bad_settings_are_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        tiny_rl2(**settings)
+
+
+def test_it_has_no_explorers() -> None:
+    model = tiny_rl2()
+    assert model.start_adaptation(2, "own").exploring().all()
+    with pytest.raises(ValueError, match="RL2 has no explorers, but the explorer is 'prior': leave it away"):
+        model.start_adaptation(2, "prior")

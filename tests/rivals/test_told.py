@@ -1,0 +1,98 @@
+"""Ceilings that are told the task, SAC with HER and scripts; and the floor."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+
+from helpers import ENV_ID
+from htr_envs import PointRobotFamily
+from sb3_htr import evaluate_adaptation
+from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.rivals.sac_her import SACHER, ShownTaskVecEnv, TaskHerReplayBuffer
+from sb3_htr.rivals.scripted import ScriptedAgent
+
+N_STEPS = 20
+
+
+def tiny_sac_her(env: Any = None, **kwargs: Any) -> SACHER:
+    """A SACHER that trains in a moment, 80 steps a rollout."""
+    env = make_task_vec_env(ENV_ID, 4, seed=0) if env is None else env
+    settings = {"gradient_steps": 2, "learning_starts": 0, "batch_size": 32, "buffer_size": 4000, "seed": 0}
+    return SACHER("MultiInputPolicy", env, **{**settings, "policy_kwargs": {"net_arch": [8]}, **kwargs})
+
+
+def test_the_task_and_what_the_state_solves_are_shown() -> None:
+    inner = make_task_vec_env(ENV_ID, 3, seed=0)
+    env, rng = ShownTaskVecEnv(inner), np.random.default_rng(0)
+    obs: Any = env.reset()
+    before = inner.get_attr("task")
+    for _ in range(N_STEPS):
+        np.testing.assert_array_equal(obs["desired_goal"], before)
+        np.testing.assert_allclose(obs["achieved_goal"], obs["observation"])
+        obs, _, dones, infos = env.step(rng.uniform(-1, 1, (3, 2)).astype(np.float32))
+    assert dones.all()
+    np.testing.assert_array_equal(obs["desired_goal"], inner.get_attr("task"))
+    for info, task in zip(infos, before, strict=True):
+        final = info["terminal_observation"]
+        np.testing.assert_array_equal(final["desired_goal"], task)
+        np.testing.assert_allclose(final["achieved_goal"], info["achieved_task"], atol=1e-6)
+
+
+def test_relabelled_rewards_are_those_of_the_task_family() -> None:
+    model, family = tiny_sac_her().learn(400), PointRobotFamily()
+    assert isinstance(model.replay_buffer, TaskHerReplayBuffer)
+    data = model.replay_buffer.sample(400)
+    goals, reached = (data.observations["desired_goal"].numpy(), data.next_observations["observation"].numpy())
+    assert th.equal(data.observations["desired_goal"], data.next_observations["desired_goal"])
+    distance = np.linalg.norm(goals - reached, axis=1)
+    expected = np.where(distance < 0.2, 1 - distance, 0)
+    np.testing.assert_allclose(data.rewards[:, 0].numpy(), expected, atol=1e-5)
+    is_own = (np.abs(goals[:, None] - family.train_tasks).max(axis=-1) < 1e-6).any(axis=1)
+    assert 0.1 < is_own.mean() < 0.3, "four of five are relabelled"
+    assert (expected[~is_own] > 0).mean() > 0.3
+
+
+def test_it_learns_and_is_the_same_after_save_and_load(tmp_path: Any) -> None:
+    model = tiny_sac_her().learn(240)
+    assert model._n_updates > 0
+    model.save(tmp_path / "model")
+    loaded = SACHER.load(tmp_path / "model")
+    (ours, _), (theirs, _) = (evaluate_adaptation(agent, ENV_ID, n_episodes=2, seed=4) for agent in (model, loaded))
+    np.testing.assert_array_equal(ours, theirs)
+    loaded.set_env(make_task_vec_env(ENV_ID, 4))
+
+
+def test_tasks_that_a_state_does_not_tell_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the action did is not in the observation after it."""
+
+    def of_the_step(self: Any, traj: Any, index: Any) -> np.ndarray:
+        return np.asarray((traj.observations + traj.actions)[..., index, :], dtype=np.float32)
+
+    monkeypatch.setattr(PointRobotFamily, "hindsight_task", of_the_step)
+    with pytest.raises(ValueError, match="tasks of PointRobotFamily are no functions of a state"):
+        tiny_sac_her().learn(80)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"gradient_steps": -2}, "gradient_steps is -2, expected a whole number of at least -1"),
+        ({"train_freq": 1}, "SACHER has no setting 'train_freq'"),
+        ({"env": "Pendulum-v1"}, "no task_family"),
+    ],
+)
+def test_bad_settings_are_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        tiny_sac_her(**settings)
+
+
+def test_floor_and_ceiling_of_the_point_robot() -> None:
+    """13.38 is the best return that there is, and one of a thousand random episodes solves its task."""
+    space: Any = make_task_vec_env(ENV_ID).action_space
+    straight = ScriptedAgent(space, lambda obs, tasks: np.clip((tasks - obs) / 0.1, -1, 1))
+    returns, successes = evaluate_adaptation(straight, ENV_ID, n_episodes=2)
+    assert successes.all() and 13.3 < returns.mean() < 13.4
+    returns, successes = evaluate_adaptation(ScriptedAgent.random(space), ENV_ID, n_episodes=3)
+    assert returns.mean() < 0.1 and successes.mean() < 0.02

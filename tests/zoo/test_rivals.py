@@ -1,0 +1,120 @@
+"""Rivals have the commands of PEARL."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from helpers import ENV_ID
+from helpers.runs import run_folder
+from sb3_htr import evaluate_adaptation
+from sb3_htr.zoo.cli import main
+from sb3_htr.zoo.run.agents import RECORD, TrainedAgent, agent_at
+from sb3_htr.zoo.run.algorithm import ALGORITHMS
+from sb3_htr.zoo.run.method import methods
+from sb3_htr.zoo.run.shipped import hyperparams_file
+
+SMALL: dict[str, list[str]] = {
+    "rl2": ["n_episodes_per_trial:2", "n_epochs:1", "policy_kwargs:{'lstm_hidden_size':4,'net_arch':[4]}"],
+    "sac-her": ["gradient_steps:2", "policy_kwargs:{'net_arch':[4]}", "n_envs:8", "buffer_size:2000"],
+}
+STEPS = {"rl2": 3200, "sac-her": 160}
+
+
+def train(method: str, folder: Path, *arguments: str) -> None:
+    n = STEPS[method]
+    how_long = ["-n", str(2 * n), "--eval-freq", str(2 * n), "--save-freq", str(n), "--verbose", "0", "--seed", "1"]
+    where = ["train", "--env", ENV_ID, "--method", method, "-f", str(folder)]
+    assert main([*where, *how_long, *arguments, "-params", *SMALL[method]]) == 0
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs")
+    for method in SMALL:
+        train(method, folder, "-P")
+    return folder
+
+
+@pytest.mark.parametrize("method", SMALL)
+def test_all_commands_take_them(method: str, runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = run_folder(runs, method)
+    assert json.loads((run / RECORD).read_text())["method"] == method
+    # Without pickle, as with it
+    agent = agent_at(run, "last")
+    records = [evaluate_adaptation(agent.load(trust=trust), ENV_ID, n_episodes=2) for trust in (False, True)]
+    np.testing.assert_array_equal(records[0], records[1])
+    few = ["--n-episodes", "2"]
+    assert main(["evaluate", str(run), "-o", str(tmp_path), *few, "--tasks", "validation"]) == 0
+    assert "20 validation tasks of SparsePointRobot-v0, explorer 'own'" in capsys.readouterr().out
+    assert main(["enjoy", str(run), "--no-render", "--n-tasks", "1", *few]) == 0
+    assert "uncertainty of z" not in capsys.readouterr().out
+    assert main(["plot", str(run), "-o", str(tmp_path / "plots"), *few, "--tasks", "validation"]) == 0
+    assert {path.stem for path in (tmp_path / "plots").iterdir()} == {
+        "learning_curves",
+        "adaptation_curve",
+        "adaptation_paths",
+    }
+    with pytest.raises(ValueError, match="has no explorers, but the explorer is 'prior'"):
+        main(["evaluate", str(run), "--explorer", "prior"])
+
+
+@pytest.mark.parametrize("method", SMALL)
+def test_what_is_exported_acts_the_same_and_says_how_to_use_it(
+    method: str, runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert main(["export", str(runs / method), "-o", str(tmp_path / "agent"), "--n-episodes", "2"]) == 0
+    run, file = agent_at(runs / method), tmp_path / "agent" / f"{ENV_ID}.zip"
+    ours, theirs = (evaluate_adaptation(agent.load(), ENV_ID, n_episodes=2) for agent in (run, agent_at(file)))
+    np.testing.assert_array_equal(ours, theirs)
+    card = (file.parent / "README.md").read_text()
+    assert methods()[method].about in card and ALGORITHMS[method].about in card and "prior" not in card
+    assert f"--method {method}" in card and yaml.safe_load(card.split("---")[1])["model-index"][0]["name"] == method
+    monkeypatch.chdir(file.parent)
+    exec(re.findall(r"```python\n(.*?)```", card, re.DOTALL)[0], {})
+
+
+def test_a_run_of_a_rival_goes_on(runs: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(run_folder(runs, "sac-her"), run)
+    assert main(["train", "--resume", str(run), "-n", "160"]) == 0
+    assert agent_at(run, "last").load().num_timesteps == 480
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--algo", "ppo"], "--algo is 'ppo', but sb3-htr trains rl2"),
+        (["-params", "n_steps:20"], "n_steps follows from n_trials_per_rollout"),
+        (["-params", "lstm:20"], "RL2 has no setting 'lstm'"),
+        (["-params", "method:'htr-ser'", "-optimize"], "The search is for settings of PEARL, and rl2 has none"),
+    ],
+)
+def test_mistakes_are_answered_in_one_sentence(arguments: list[str], message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=message):
+        main(["train", "--env", ENV_ID, "--method", "rl2", "-f", str(tmp_path), "--verbose", "0", *arguments])
+
+
+def test_a_method_of_another_algorithm_cannot_stand_in_a_yaml_file(tmp_path: Path) -> None:
+    """The file has the settings of one algorithm."""
+    with pytest.raises(ValueError, match="rl2 is trained by another algorithm: choose it by --method rl2"):
+        main(["train", "--env", ENV_ID, "-f", str(tmp_path), "--verbose", "0", "-params", "method:'rl2'"])
+
+
+def test_a_file_that_does_not_fit_its_record_is_refused(runs: Path) -> None:
+    agent = agent_at(runs / "sac-her")
+    for wrong in ({"net_arch": [5]}, {"net_arch": "[5]"}, {"features_extractor_class": "os.system"}, {"width": 3}):
+        record: dict[str, Any] = {**agent.record, "hyperparams": {"policy_kwargs": wrong}}
+        with pytest.raises(ValueError, match="is damaged, or no sac-her model with the settings of its record"):
+            TrainedAgent(agent.path, record, None).load()
+
+
+@pytest.mark.parametrize("file", ["rl2.yml", "sac_her.yml"])
+def test_every_hyperparameter_names_its_source(file: str) -> None:
+    settings = [line for line in hyperparams_file(file).read_text().splitlines() if re.match(r"\s+\w+: *[^&* ]", line)]
+    assert len(settings) > 5 and all("# " in line for line in settings)
