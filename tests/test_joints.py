@@ -25,6 +25,7 @@ from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.adaptation import Belief, Explorer, Step
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
 from sb3_htr.experiments import grid, report
+from sb3_htr.experiments.cell import Evaluation
 from sb3_htr.experiments.grid import Experiment, Variant
 from sb3_htr.experiments.runner import run_cells
 from sb3_htr.htr import Relabeller
@@ -330,7 +331,9 @@ def test_an_experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[str] = []
     tiny = {**yaml.safe_load("{n_envs: 4, learning_starts: 240}"), **{key: TINY[key] for key in TINY if key != "seed"}}
     row = Variant("htr-ser", "sharp", {**tiny, "explorer": {"margin": 0.7}})
-    experiment = Experiment("toy", "A toy.", ENV_ID, 960, (row,), 1, 480, explorers=("aggregate",), figure=figure)
+    experiment = Experiment(
+        "toy", "A toy.", ENV_ID, 960, (row,), 1, 480, evaluations=(Evaluation("aggregate", {}),), figure=figure
+    )
     monkeypatch.setattr("sb3_htr.experiments.protocol.EVAL_SEEDS", (1,))
     monkeypatch.setitem(grid.EXPERIMENTS, "toy", experiment)
     runs, results = tmp_path / "runs", tmp_path / "results"

@@ -11,7 +11,7 @@ import numpy as np
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.experiments import figures
 from sb3_htr.experiments.calibration import expected_calibration_error
-from sb3_htr.experiments.cell import Cell, name_of_test
+from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.grid import Experiment
 from sb3_htr.experiments.protocol import EVAL_SEEDS, METRICS, scores
 from sb3_htr.experiments.runner import LOGGED
@@ -43,14 +43,13 @@ def summarize(command: str, results: dict[Cell, Path]) -> dict[str, Any]:
             means = {key: round(float(np.mean([raw[key] for raw in raws])), 4) for key in (*LOGGED, "wall_s")}
             calibration_error = expected_calibration_error(np.sum([raw["calibration"] for raw in raws], axis=0))
             means["calibration_error"] = round(calibration_error, 4)
-            for explorer, tested_on in first.tests:
-                test = name_of_test(explorer, tested_on)
-                tested = {**about, "explorer": explorer, "tested_on": tested_on}
+            for evaluation in first.evaluations:
+                tested = {**about, **evaluation._asdict()}
                 for metric in METRICS:
-                    interval = _rounded(iqm_interval(scores(raws, metric, test)))
+                    interval = _rounded(iqm_interval(scores(raws, metric, evaluation.name)))
                     rows.append({**tested, "metric": metric, **interval, **means})
-                returns = scores(raws, "last_episode_return", test)
-                reference = references.setdefault(test, returns)
+                returns = scores(raws, "last_episode_return", evaluation.name)
+                reference = references.setdefault(evaluation.name, returns)
                 if variant != compared:
                     difference = {**tested, "of": compared, "metric": "last_episode_return"}
                     differences.append({**difference, **_rounded(iqm_difference(reference, returns))})

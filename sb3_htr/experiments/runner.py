@@ -24,7 +24,7 @@ LOGGED = ("relabelled_fraction", "rl_reward_mean", "rl_zero_reward_fraction")
 
 def run_cell(cell: Cell, runs: Path) -> Path:
     """
-    Train, unless there is a finished run, then test the final model.
+    Train, unless there is a finished run, then evaluate the final model.
 
     :param cell: what to run
     :param runs: folder of all experiments' runs; a cell that has a result there is not run again
@@ -58,7 +58,8 @@ def run_cell(cell: Cell, runs: Path) -> Path:
     }
     with atomic_path(result) as path:
         np.savez_compressed(path, **arrays)
-    scores = {explorer: round(float(last_episode_return(arrays, explorer).mean()), 2) for explorer in cell.explorers}
+    names = [evaluation.name for evaluation in cell.evaluations]
+    scores = {name: round(float(last_episode_return(arrays, name).mean()), 2) for name in names}
     print(f"{cell.experiment}/{cell.name}: {json.dumps(scores)}")
     return result
 

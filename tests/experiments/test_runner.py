@@ -13,7 +13,7 @@ import pytest
 from helpers import ENV_ID
 from sb3_htr.common.resume import checkpoints
 from sb3_htr.experiments import grid
-from sb3_htr.experiments.grid import Experiment, Variant
+from sb3_htr.experiments.grid import Experiment, Variant, by
 from sb3_htr.experiments.runner import find_finished, run_cell
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run.agents import agent_at
@@ -43,7 +43,7 @@ def refuse(*_: Any, **__: Any) -> None:
 
 def test_a_killed_run_goes_on_and_a_finished_one_is_tested(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     variant = Variant("htr-ser", "tiny", SMALL)
-    experiment = Experiment("one", "", ENV_ID, 1200, (variant,), 1, 480, ("belief", "prior"), ({"goal_distance": 0.3},))
+    experiment = Experiment("one", "", ENV_ID, 1200, (variant,), 1, 480, by(("belief", "prior"), {}, {"goal_distance": 0.3}))
     (cell,) = experiment.cells()
     folder = cell.run_folder(tmp_path)
     killed = subprocess.run([*cell.training(folder), "--save-freq", "1"], check=False, capture_output=True, text=True)
@@ -65,7 +65,7 @@ def test_a_killed_run_goes_on_and_a_finished_one_is_tested(tmp_path: Path, monke
     assert run_cell(cell, tmp_path) == result and result.stat().st_mtime_ns == changed, "a result is not made again"
     # As from another place, where it was trained: without checkpoints and results
     shutil.rmtree(run / "checkpoints")
-    others = replace(cell, experiment="other", explorers=("prior",), elsewhere=())
+    others = replace(cell, experiment="other", evaluations=by(("prior",)))
     again = np.load(run_cell(others, tmp_path))
     assert (again["returns_prior"] == raw["returns_prior"]).all() and "returns_belief" not in again
     with pytest.raises(ValueError, match="seed 1, but other/tiny-seed2 needs 2: move this run away"):
@@ -79,7 +79,7 @@ def test_the_command_repeats_an_experiment(
     """With `--quick`, one seed and a tenth of the env steps; each cell trains by its method, with its settings."""
     settings = {**SMALL, "replay_buffer_kwargs": {"relabeller": {"cell_size": 0.3}}}
     variants = (Variant("htr-ec", "coarse", settings, {"goal_distance": 0.5}), Variant("pearl-sparse-prior", "", SMALL))
-    experiment = Experiment("tiny", "Two tiny runs.", ENV_ID, 9600, variants, eval_freq=4800, explorers=("belief",))
+    experiment = Experiment("tiny", "Two tiny runs.", ENV_ID, 9600, variants, eval_freq=4800, evaluations=by(("belief",)))
     monkeypatch.setitem(grid.EXPERIMENTS, "tiny", experiment)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit):
