@@ -1,7 +1,6 @@
 """One run of an experiment: what is trained, and how the final model is evaluated."""
 
 import re
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -79,12 +78,12 @@ class Cell:
     def training(self, folder: Path) -> list[str]:
         """
         :param folder: log folder
-        :return: command line of the training
+        :return: arguments of ``sb3-htr train``
         """
         settings = [f"{key}:{value!r}" for key, value in self.settings.items()]
         kwargs = [f"{key}:{value!r}" for key, value in self.env_kwargs.items()]
         return [
-            *(sys.executable, "-m", "sb3_htr.zoo.cli", "train", "--env", self.env_id, "--method", self.method),
+            *("--env", self.env_id, "--method", self.method),
             *("-f", str(folder), "--verbose", "0", "-n", str(self.n_timesteps)),
             *("--seed", str(self.seed), "--eval-freq", str(self.eval_freq)),
             *(["-params", *settings] if settings else []),
