@@ -47,7 +47,7 @@ class Driver:
         self.runs.mkdir(parents=True, exist_ok=True)
         try:
             while todo := self._look():
-                submitted = [cell.name for cell in self._futures.values()]
+                submitted = {cell.name for cell in self._futures.values()}
                 for cell in todo:
                     if cell.name not in submitted and not self.is_claimed(cell):
                         self._futures[self.executor.submit(run_cell, cell, self.runs)] = cell
@@ -68,10 +68,13 @@ class Driver:
         """
         :return: cells that have no result, and were not given up
         """
-        # A listing is fresh where answers about single files may be remembered, as by NFS
+        results = self._results()
+        return [cell for cell in self.cells if cell.result(self.runs).name not in results and cell.name not in self.failed]
+
+    def _results(self) -> set[str]:
+        """Names of result files. A listing is fresh where answers about single files may be remembered, as by NFS."""
         folder = self.cells[0].result(self.runs).parent
-        names = set(os.listdir(folder)) if folder.exists() else set()
-        return [c for c in self.cells if c.result(self.runs).name not in names and c.name not in self.failed]
+        return set(os.listdir(folder)) if folder.exists() else set()
 
     def is_claimed(self, cell: Cell) -> bool:
         """
@@ -110,7 +113,8 @@ class Driver:
         return ", ".join(parts)
 
     def _look(self) -> list[Cell]:
-        todo, start = self.todo(), time.monotonic()
+        start = time.monotonic()
+        todo = self.todo()
         if start >= self._next_line or not todo:
             print(self.line(todo), flush=True)
             self._next_line = start + LINES
@@ -118,18 +122,24 @@ class Driver:
         return todo
 
     def _wait(self) -> None:
-        """Until a cell has ended here, or it is time to look at what others did."""
-        timeout = max(self._next_look - time.monotonic(), 0)
-        if not self._futures:
-            time.sleep(timeout)
-        for future in wait(self._futures, timeout, FIRST_COMPLETED).done:
-            cell, error = self._futures.pop(future), future.exception()
-            if isinstance(error, Exception):
-                self._fail(cell, f"{type(error).__name__}: {error}")
-            elif error is not None:
-                raise error
-            elif future.result() and cell in self.todo():
-                self._fail(cell, f"its node has a result that is not in {self.runs} here: give --runs that all nodes see.")
+        """Until nothing runs here, or it is time to look at what others did."""
+        while (timeout := self._next_look - time.monotonic()) > 0:
+            if not self._futures:
+                time.sleep(timeout)
+            for future in wait(self._futures, timeout, FIRST_COMPLETED).done:
+                self._end(self._futures.pop(future), future)
+                if not self._futures:
+                    return
+
+    def _end(self, cell: Cell, future: Future[bool]) -> None:
+        error = future.exception()
+        if isinstance(error, Exception):
+            # Ray's text is a traceback, with the error at its end
+            self._fail(cell, f"{type(error).__name__}: {error}".strip().splitlines()[-1])
+        elif error is not None:
+            raise error
+        elif future.result() and cell.result(self.runs).name not in self._results():
+            self._fail(cell, f"its node has a result that is not in {self.runs} here: give --runs that all nodes see.")
 
     def _fail(self, cell: Cell, reason: str) -> None:
         at = cell.name, self.n_steps(cell)

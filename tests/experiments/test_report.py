@@ -62,6 +62,10 @@ def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monk
     n_settings = len({str(cell.env_kwargs) for cell in cells})
     assert len(summary["differences"]) == (len(variants) - n_settings) * n_tests
     assert all(difference["low"] <= 0 <= difference["high"] for difference in summary["differences"])
+    for difference in summary["explorer_differences"]:
+        assert difference["explorer"] != difference["of"] and difference["low"] == difference["iqm"] == difference["high"] == 0
+    n_places = len({str(evaluation.tested_on) for evaluation in experiment.evaluations})
+    assert len(summary["explorer_differences"]) == len(variants) * (n_tests - n_places)
     assert {difference["of"] for difference in summary["differences"]} <= {experiment.variants[0].name or "htr-ser"}
     table = tables.table(summary)
     assert table.count("| 1.00 [1.00, 1.00] | 3.00 [3.00, 3.00] |") == len(variants) * n_tests
