@@ -303,9 +303,18 @@ def heights() -> Iterator[str]:
     del gym.registry["SparseHeights-v0"]
 
 
+# Enough for a family of one's own
+LEARNS: dict[str, Any] = {
+    "gradient_steps": 100,
+    "meta_batch_size": 32,
+    "batch_size": 16,
+    "policy_kwargs": {"net_arch": [64, 64], "encoder_arch": [64, 64], "latent_dim": 3},
+}
+
+
 def test_an_env_family(heights: str, tiny_pearl: MakePEARL) -> None:
     check_task_env(gym.make(heights))
-    model = tiny_pearl(heights, gradient_steps=20).learn(4 * 4 * 3 * 25)
+    model = tiny_pearl(heights, seed=1, **LEARNS).learn(8 * 4 * 3 * 25)
     assert model.env is not None and isinstance(model.env.unwrapped, BatchedTaskVecEnv), "its batched env is used"
     buffer = model.replay_buffer
     assert buffer is not None and isinstance(buffer.task_family, Heights) and buffer.max_episode_steps == 25

@@ -76,20 +76,27 @@ def _interval(row: dict[str, Any]) -> str:
     return f"{row['iqm']:.1f} [{row['low']:.1f}, {row['high']:.1f}]"
 
 
+def filled(text: str, tables: dict[str, str]) -> str:
+    """
+    :param text: of a document
+    :param tables: what goes between ``<!-- NAME -->`` and ``<!-- end -->``, by name
+    :return: the document with it
+    """
+    for name, content in tables.items():
+        start, end = f"<!-- {name} -->\n", "<!-- end -->"
+        if start in text:
+            before, _, after = text.partition(start)
+            text = before + start + content + end + after.partition(end)[2]
+    return text
+
+
 def fill(documents: Iterable[Path], tables: dict[str, str]) -> None:
     """
-    Replace what stands between ``<!-- NAME -->`` and ``<!-- end -->``.
-
     :param documents: files to write
-    :param tables: what goes there, by name
+    :param tables: see :func:`filled`
     """
     for document in documents:
-        text = document.read_text()
-        for name, content in tables.items():
-            start, end = f"<!-- {name} -->\n", "<!-- end -->"
-            if start in text:
-                before, _, after = text.partition(start)
-                text = before + start + content + end + after.partition(end)[2]
+        text = filled(document.read_text(), tables)
         with atomic_path(document) as temporary:
             temporary.write_text(text)
 

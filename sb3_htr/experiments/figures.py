@@ -1,6 +1,5 @@
 """The pictures of experiments, from the raw results of their cells."""
 
-from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.protocol import scores
 from sb3_htr.zoo.plots.curves import band, finish
 from sb3_htr.zoo.plots.intervals import iqm_interval
-from sb3_htr.zoo.plots.style import COLOURS, save
+from sb3_htr.zoo.plots.style import COLOURS, curve_styles, save
 
 Results = dict[Cell, Path]
 
@@ -45,7 +44,8 @@ def learning(results: Results, path: Path) -> None:
     :param path: picture to write
     """
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
-    for colour, (variant, runs) in zip(COLOURS, by_variant(results).items(), strict=False):
+    groups = by_variant(results)
+    for (colour, _), (variant, runs) in zip(curve_styles([*groups]), groups.items(), strict=True):
         curve = np.stack([raw["curve"].mean(axis=1) for _, raw in runs])
         band(left, runs[0][1]["timesteps"] / 1000, curve, colour, "-", variant)
         for explorer, style in zip(("belief", "prior"), ("-", "--"), strict=True):
@@ -87,7 +87,8 @@ def goal_distance(results: Results, path: Path) -> None:
     :param path: picture to write
     """
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
-    for colour, (variant, runs) in zip(COLOURS, by_variant(results).items(), strict=False):
+    groups = by_variant(results)
+    for (colour, _), (variant, runs) in zip(curve_styles([*groups]), groups.items(), strict=True):
         x = sorted({cell.env_kwargs["goal_distance"] for cell, _ in runs})
 
         ordered = sorted(runs, key=lambda run: (run[0].env_kwargs["goal_distance"], run[0].seed))
@@ -128,7 +129,7 @@ def relabelling(results: Results, path: Path) -> None:
     left.set_ylabel("return of the 20th adaptation episode")
     left.set_title("test tasks, final models", fontsize=10)
     shown = [variant for variant in groups if variant == "K = 0.8" or not variant.startswith("K = ")]
-    for colour, variant in zip(COLOURS, shown, strict=False):
+    for (colour, _), variant in zip(curve_styles(shown), shown, strict=True):
         curve = np.stack([run["curve"].mean(axis=1) for run in groups[variant]])
         band(right, groups[variant][0]["timesteps"] / 1000, curve, colour, "-", variant)
     right.set_xlabel("thousand env steps of meta-training")
@@ -175,7 +176,8 @@ def reliability(results: Results, path: Path) -> None:
     """
     figure, axes = plt.subplots(figsize=(4.8, 4.4), layout="constrained")
     axes.plot([0, 1], [0, 1], color=COLOURS[6], linewidth=1)
-    for colour, (variant, runs) in zip(cycle(COLOURS), by_variant(results).items(), strict=False):
+    groups = by_variant(results)
+    for (colour, _), (variant, runs) in zip(curve_styles([*groups]), groups.items(), strict=True):
         bins = np.sum([raw["calibration"] for _, raw in runs], axis=0)
         n, probability, successes = bins[bins[:, 0] > 0].T
         label = f"{variant}: expected calibration error {expected_calibration_error(bins):.3f}"

@@ -47,7 +47,7 @@ class Counter(BaseCallback):
         {"learning_rate": lambda remaining: 1e-3 * remaining},
         {"target_update_interval": 2, "explorer": PRIOR, "train_explorer": PRIOR},
         {"train_explorer": "belief"},
-        {"policy_kwargs": with_policy(normalize_observations=True)},
+        {"policy_kwargs": with_policy(normalize_observations=False)},
         {"replay_buffer_kwargs": {"relabel_probability": 0.0, "rl_reward_type": "dense"}},
         {"replay_buffer_kwargs": {"relabeller": {"name": "SingleEpisodeRelabelling", "hindsight_task_strategy": "final"}}},
         {"replay_buffer_kwargs": {"relabel_probability": 1.0, "relabeller": EpisodeClustering()}},
