@@ -1,7 +1,9 @@
 """Each cell of a grid gets one result, whoever runs it and whatever fails on the way."""
 
 import os
+import re
 import signal
+import subprocess
 import threading
 import time
 from collections.abc import Callable
@@ -17,11 +19,12 @@ from sb3_htr.experiments import driver as driver_module
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.driver import ATTEMPTS, Driver
 from sb3_htr.experiments.executors import Here, Processes
-from sb3_htr.experiments.grid import Experiment, Variant
+from sb3_htr.experiments.grid import EXPERIMENTS, Experiment, Variant
 from sb3_htr.experiments.runner import claim, run_cell
 
 CELLS = Experiment("toy", "", "SparsePointRobot-v0", 1000, (Variant("htr-ser"), Variant("htr-ec", "K = 0.8")), 3).cells()
 Arrays = dict[str, Any]
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(autouse=True)
@@ -157,3 +160,16 @@ def test_a_killed_worker_process_takes_no_other_with_it() -> None:
     with Processes(2) as executor:
         killed, other = executor.submit(os._exit, 9), executor.submit(os.getpid)
         assert other.result() != os.getpid() and "terminated abruptly" in str(killed.exception())
+
+
+def test_the_job_array_of_the_manual_runs_its_cell(tmp_path: Path) -> None:
+    """As Slurm would, but with a command that only says how it was called."""
+    script = re.findall(r"```bash\n(.*?)```", (ROOT / "docs" / "scaling.md").read_text(), re.DOTALL)[0]
+    cells = EXPERIMENTS["point_robot"].cells()
+    assert f"--array=0-{len(cells) - 1}\n" in script
+    command = tmp_path / "sb3-htr"
+    command.write_text('#!/bin/bash\necho "$OMP_NUM_THREADS:" "$@"\n')
+    command.chmod(0o755)
+    environment = {"PATH": f"{tmp_path}:/usr/bin:/bin", "SLURM_ARRAY_TASK_ID": "7"}
+    said = subprocess.run(["bash", "-c", script], env=environment, capture_output=True, text=True, check=True).stdout
+    assert said == "1: experiment point_robot --runs /shared/runs --cell 7\n"
