@@ -1,10 +1,12 @@
 """Where cells run. An executor is a ``concurrent.futures.Executor``, so those of Dask, MPI or submitit fit, too."""
 
 import os
+import socket
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
 from typing import Any, TypeVar
+from urllib.parse import urlsplit
 
 T = TypeVar("T")
 
@@ -56,8 +58,12 @@ class Ray(Executor):
 
         self._ray = ray
         try:
+            if address != "auto":
+                # Ray waits for minutes where nobody answers
+                parts = urlsplit(address if "://" in address else f"//{address}")
+                socket.create_connection((parts.hostname or "", parts.port or 0), timeout=5).close()
             ray.init(address, log_to_driver=False)
-        except (ConnectionError, ValueError, RuntimeError) as error:
+        except (OSError, ValueError, RuntimeError) as error:
             raise ConnectionError(
                 f"No Ray cluster answers at {address} ({error}): start one with `ray start --head`, or leave --ray away."
             ) from None

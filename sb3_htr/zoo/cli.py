@@ -40,6 +40,7 @@ EXTRAS = {
     "metaworld": "metaworld",
     "tensorboard": "tensorboard",
     "psycopg": "postgresql",
+    "ray": "ray",
 }
 # What a user can put right, and has a sentence of its own: bad settings and files, missing packages, unknown envs, training
 # that diverges
