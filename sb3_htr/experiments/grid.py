@@ -132,7 +132,7 @@ ALL = (
         POINT,
         150_000,
         (Variant("htr-ser"),),
-        evaluations=by((*BELIEF, *ABLATIONS, *EXPLORERS[1:]), *DISTANCES),
+        evaluations=by((*BELIEF, *ABLATIONS, "aggregate"), *DISTANCES),
         models_of="point_robot",
         figure=figures.evaluations,
     ),
