@@ -15,12 +15,14 @@ import pytest
 import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
+from stable_baselines3.common.utils import LinearSchedule
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL, many
 from helpers.bombs import Bomb, bombs
 from sb3_htr import PEARL, evaluate_adaptation, load_untrusted
 from sb3_htr.adaptation import Belief, Prior
 from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.htr import EpisodeClustering
 
 
 def repack(source: Path, target: Path, changed: dict[str, bytes]) -> None:
@@ -79,15 +81,25 @@ def test_loading_an_untrusted_model_runs_no_code(tiny_pearl: MakePEARL, tmp_path
 
 def test_an_untrusted_model_acts_as_the_one_that_was_saved(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
     explorers: dict[str, Any] = {"explorer": Belief(margin=2.0), "train_explorer": Prior(2)}
-    model = tiny_pearl(gamma=0.7, kl_coef=0.02, context_size=7, **explorers).learn(3 * ROLLOUT)
+    replay = {"relabeller": {"name": "EpisodeClustering", "cell_size": 0.3}, "relabel_probability": 0.4}
+    rate = LinearSchedule(2e-3, 1e-4, 0.5)
+    settings = {"learning_rate": rate, "replay_buffer_kwargs": replay, **explorers}
+    model = tiny_pearl(gamma=0.7, kl_coef=0.02, context_size=7, **settings).learn(3 * ROLLOUT)
     model.save(tmp_path / "model.zip")
     loaded = load_untrusted(tmp_path / "model.zip", ENV_ID)
     assert loaded.gamma == 0.7 and loaded.kl_coef == 0.02 and loaded.context_size == 7
     assert loaded.num_timesteps == model.num_timesteps and loaded._n_updates == model._n_updates
+    assert loaded.replay_buffer_kwargs == replay and vars(loaded.learning_rate) == vars(rate)
     assert loaded.explorer == Belief(margin=2.0) and loaded.train_explorer == Prior(2)
     assert load_untrusted(tmp_path / "model.zip", ENV_ID, explorer="prior").explorer == Prior()
     for a, b in zip(evaluate_adaptation(model, ENV_ID), evaluate_adaptation(loaded, ENV_ID), strict=True):
         np.testing.assert_array_equal(a, b)
+    # What is pickled is left away
+    tiny_pearl(learning_rate=lambda _: 1.0, replay_buffer_kwargs={"relabeller": EpisodeClustering(0.2)}).save(
+        tmp_path / "own.zip"
+    )
+    own = load_untrusted(tmp_path / "own.zip", ENV_ID)
+    assert own.learning_rate == 1e-3 and own.replay_buffer_kwargs == {}
     with pytest.raises(ValueError, match="do not fit the env or the settings"):
         load_untrusted(tmp_path / "model.zip", "SparseTargetSpeed-v0", policy_kwargs={"latent_dim": 7})
 

@@ -21,6 +21,9 @@ from sb3_htr.zoo.run.shipped import shipped
 
 # Record of a run: in its folder, and in an exported model file
 RECORD = "run.json"
+# What it must say, and what it may say for training on and for model cards
+REQUIRED = {"env_id": str, "env_kwargs": dict, "gym_packages": list}
+OF_TRAINING = {"arguments": list, "n_timesteps": int, "seed": int, "method": str, "hyperparams": dict}
 
 
 @dataclass(frozen=True)
@@ -120,10 +123,12 @@ def read_record(path: Path, content: bytes | None = None) -> dict[str, Any]:
     """
     try:
         record = json.loads(path.read_bytes() if content is None else content)
-        texts = record["env_id"], *record["gym_packages"]
-        if isinstance(record["env_kwargs"], dict) and all(isinstance(text, str) for text in texts):
+        given = {name: kind for name, kind in OF_TRAINING.items() if name in record}
+        texts = *record["gym_packages"], *record.get("arguments", ())
+        kinds_are_right = all(type(record[name]) is kind for name, kind in {**REQUIRED, **given}.items())
+        if kinds_are_right and all(isinstance(text, str) for text in texts):
             return cast(dict[str, Any], record)
-    except (ValueError, KeyError, TypeError, RecursionError):
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         pass
     raise ValueError(f"{path} is damaged, or no record of a run: it must say env_id, env_kwargs and gym_packages.")
 

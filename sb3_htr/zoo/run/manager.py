@@ -76,11 +76,18 @@ class MetaExperimentManager(ExperimentManager):
         given, trial_id = dict(self.custom_hyperparams or {}), self.trial_id
         self.custom_hyperparams, self.trial_id = None, None
         with redirect_stdout(StringIO()):  # it prints what is not all of it
-            hyperparams, _ = super().read_hyperparameters()
+            try:
+                hyperparams, _ = super().read_hyperparameters()
+            except (AttributeError, TypeError):
+                raise ValueError(
+                    f"{self.config} is no file of hyperparameters: expected ids of envs, with settings."
+                ) from None
         in_file = hyperparams.pop("method", DEFAULT)
         in_params = given.pop("method", in_file)
         self.method = get_method(self._method_name or in_params)
         hyperparams = merged(plain_settings(hyperparams, self.config, self.trust), self.method.hyperparams())
+        if self.resumed is not None:  # what a user gave comes from a file now
+            given = plain_settings(given, self.resumed / RECORD, self.trust)
         hyperparams = merged(merged(hyperparams, self._trial(trial_id)), given)
         saved = OrderedDict(sorted(hyperparams.items()))
         print(f"Method {self.method.name}: {self.config} has the settings of the env. With those of the command line:")
