@@ -95,8 +95,11 @@ def _read(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, Any]]
         }
     if not all(isinstance(value, dict) for value in (data, *weights.values())):
         raise TypeError
-    # Of one number in a file, torch can make a tensor of any shape, which takes no memory until it is copied
-    if sum(tensor.nbytes for tensors in weights.values() for tensor in tensors.values()) > size:
+    # Of one number in a file, torch makes a tensor of any shape, and of one tensor several, without memory until they are
+    # copied. An exported model has two of one: its target critics are its critics
+    tensors = [tensor for tensors in weights.values() for tensor in tensors.values()]
+    enlarged = any(tensor.nbytes > tensor.untyped_storage().nbytes() for tensor in tensors)
+    if enlarged or sum(tensor.nbytes for tensor in tensors) > 2 * size:
         raise ValueError("PEARL's weights are not larger than their file.")
     return data, weights
 
