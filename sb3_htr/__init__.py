@@ -2,9 +2,10 @@
 
 from pathlib import Path
 
+from sb3_htr.adaptation.agent import AdaptedAgent
 from sb3_htr.adaptation.evaluation import evaluate_adaptation
 from sb3_htr.htr import MultiTaskReplayBuffer
 from sb3_htr.pearl import PEARL, load_untrusted
 
 __version__ = (Path(__file__).parent / "version.txt").read_text().strip()
-__all__ = ["PEARL", "MultiTaskReplayBuffer", "__version__", "evaluate_adaptation", "load_untrusted"]
+__all__ = ["PEARL", "AdaptedAgent", "MultiTaskReplayBuffer", "__version__", "evaluate_adaptation", "load_untrusted"]
