@@ -80,6 +80,8 @@ def test_envs_can_be_replaced_by_equal_ones_only(tiny_pearl: MakePEARL) -> None:
     model.learn(ROLLOUT, reset_num_timesteps=False)
     with pytest.raises(AssertionError, match="number of environments"):
         model.set_env(make_task_vec_env(ENV_ID, 3))
+    with pytest.raises(ValueError, match="The env is a gymnasium VectorEnv"):
+        model.set_env(gym.make_vec(ENV_ID, 4))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="Observation spaces do not match"):
         tiny_pearl().set_env(make_task_vec_env("SparseTargetSpeed-v0", 4))
     with pytest.raises(ValueError, match=r"The env has another task family: its goal_distance is 0\.5"):

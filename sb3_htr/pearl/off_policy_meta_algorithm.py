@@ -3,6 +3,7 @@
 import io
 import pathlib
 import pickle
+import traceback
 import warnings
 import zipfile
 from collections import deque
@@ -155,6 +156,11 @@ class OffPolicyMetaAlgorithm(SAC):
     def _introduce_policy(self) -> None:
         if self.replay_buffer is not None:
             self.replay_buffer.relabeller.policy = self.policy
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        checks.check_is_no_gymnasium_vector_env(env)
+        return SAC._wrap_env(env, verbose, monitor_wrapper)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """
@@ -314,7 +320,9 @@ class OffPolicyMetaAlgorithm(SAC):
         try:
             return next(steps, None)
         except ValueError as error:
-            shape = ": its observations must have the shape of its observation_space" if "broadcast" in str(error) else ""
+            # Where SB3 stores what the env returned; within the env, an error is the env's own
+            stored = traceback.extract_tb(error.__traceback__)[-1].name == "_save_obs"
+            shape = ": its observations must have the shape of its observation_space" if stored else ""
             raise ValueError(f"An env failed {where} ({error}){shape}.") from error
         except (EOFError, ConnectionError) as error:
             raise RuntimeError(
