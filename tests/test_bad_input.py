@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.error import DependencyNotInstalled
 from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -51,6 +52,10 @@ class WithoutHook(gym.Wrapper[Any, Any, Any, Any]):
         (lambda: WithSpaces(gym.make(ENV_ID), action_space=spaces.Discrete(3)), "The action space is Discrete"),
         (lambda: gym.make(ENV_ID, reward_type="dense"), "reward_type is not 'sparse'.*rl_reward_type"),
         (lambda: PointRobotEnv(), "The env has no time limit"),
+        (
+            lambda: gym.make_vec(ENV_ID, 2),
+            "is a gymnasium VectorEnv, expected one of Stable-Baselines3: pass the env's id",
+        ),
         (lambda: VecNormalize(make_task_vec_env(ENV_ID, 2)), "VecNormalize stands between .*normalize_observations"),
         (lambda: DummyVecEnv([lambda: gym.make("Pendulum-v1")]), "no task_family"),
     ],
@@ -127,6 +132,10 @@ def another_task(n_steps: int, values: list[Any]) -> None:
     values[4] = {**values[4], "task_id": n_steps % 7}
 
 
+def failing(n_steps: int, values: list[Any]) -> None:
+    np.zeros(3) + np.zeros(2)
+
+
 def no_training_task(n_steps: int, values: list[Any]) -> None:
     values[4] = {**values[4], "task_id": -1}
 
@@ -139,6 +148,7 @@ def no_training_task(n_steps: int, values: list[Any]) -> None:
         (put(0, np.full(2, np.nan, dtype=np.float32)), r"The next_observation of task .* is \[nan nan\], expected finite"),
         (put(1, 0.5), r"The env gave 0.5 for a step of task \d+, but its compute_reward gives 0: .*check_task_env"),
         (put(0, np.zeros(3, dtype=np.float32)), r"An env failed at env step \d+, on one of .* tasks \[\d+\].*the shape of"),
+        (failing, r"An env failed at env step \d+, on one .* \(operands could not be broadcast .* \)\.$"),
         (put(3, False), r"An episode is longer than the env's time limit of 20 steps"),
         (another_task, r"The task of env 0 changed from \d to \d within an episode"),
         (no_training_task, r"info\['task_id'\] is -1, expected a training task"),
@@ -155,6 +165,12 @@ def test_episodes_of_one_step_are_episodes(tiny_pearl: MakePEARL) -> None:
     env = Changed(gym.make(ENV_ID), put(2, True))
     model = tiny_pearl(env, n_tasks_per_rollout=1, n_episodes_per_task=50).learn(200)
     assert model.replay_buffer is not None and model.replay_buffer.n_episodes.sum() == 200
+
+
+def test_a_time_limit_around_an_env_is_one(tiny_pearl: MakePEARL) -> None:
+    env = gym.wrappers.TimeLimit(PointRobotEnv(), 7)
+    model = tiny_pearl(env, n_tasks_per_rollout=1).learn(20)
+    assert model.replay_buffer is not None and model.replay_buffer.max_episode_steps == 7
 
 
 def test_an_env_may_reuse_its_arrays(tiny_pearl: MakePEARL) -> None:
@@ -176,6 +192,17 @@ def test_an_env_may_reuse_its_arrays(tiny_pearl: MakePEARL) -> None:
 def test_a_meta_batch_may_be_larger_than_the_number_of_tasks(tiny_pearl: MakePEARL) -> None:
     env = make_task_vec_env(ENV_ID, 2, env_kwargs={"n_train_tasks": 2, "n_test_tasks": 1})
     tiny_pearl(env, n_tasks_per_rollout=2, meta_batch_size=50).learn(2 * ROLLOUT)
+
+
+def test_a_window_without_a_screen_is_refused_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("mujoco")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    env = gym.make("SparseWheeled-v0", render_mode="rgb_array")
+    env.reset()
+    with pytest.raises(DependencyNotInstalled, match=r"MUJOCO_GL is glfw, which needs a screen, .*: set MUJOCO_GL=egl"):
+        env.render()
 
 
 @pytest.mark.parametrize(
@@ -207,7 +234,8 @@ def test_what_cannot_be_trained_is_refused_in_one_sentence(
     monkeypatch.chdir(tmp_path)
     with pytest.raises((ValueError, ImportError), match=message) as refusal:
         main(["train", *arguments])
-    assert "\n" not in str(refusal.value) and not list(tmp_path.rglob("*.zip"))
+    assert "\n" not in str(refusal.value)
+    assert not list(tmp_path.rglob("*_1")), "no folder of a run that there is not"
 
 
 def test_only_the_envs_of_a_model_can_be_adapted_to(tiny_pearl: MakePEARL) -> None:

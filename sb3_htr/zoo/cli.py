@@ -28,11 +28,8 @@ USAGE = (
 )
 # Packages that the base installation does not bring, and the extra that does
 EXTRAS = {
-    "rl_zoo3": "zoo",
-    "optuna": "zoo",
-    "huggingface_hub": "zoo",
-    "matplotlib": "plots",
-    "rliable": "plots",
+    **dict.fromkeys(("rl_zoo3", "optuna", "sqlalchemy", "yaml", "huggingface_hub", "filelock"), "zoo"),
+    **dict.fromkeys(("matplotlib", "rliable", "pandas", "scipy"), "plots"),
     "PIL": "video",
     "imageio_ffmpeg": "video",
     "mujoco": "mujoco",

@@ -1,5 +1,6 @@
 """Agents found and shared, and what the commands say to mistakes."""
 
+import ast
 import json
 import re
 import shutil
@@ -143,6 +144,17 @@ def test_missing_extras_are_named_with_the_pip_command(
     monkeypatch.setitem(sys.modules, package, None)
     assert main([command, "--env", ENV_ID]) == 1
     assert f"needs {package}, which is not installed: pip install 'sb3_htr[{extra}]'" in capsys.readouterr().err
+
+
+def test_every_package_that_a_command_may_miss_has_its_extra() -> None:
+    """A bare ``sb3-htr export`` once said that there is no yaml."""
+    installed = {"gymnasium", "numpy", "torch", "stable_baselines3", "sb3_htr", "htr_envs", "tqdm", *sys.stdlib_module_names}
+    for file in Path(cli.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            for package in {name.split(".")[0] for name in names} - installed:
+                assert package in cli.EXTRAS, f"{file.name} imports {package}"
 
 
 def test_the_console_answers_mistakes_in_one_sentence(

@@ -48,7 +48,8 @@ def main(argv: Sequence[str]) -> None:
     args, rest = parser.parse_known_args(argv)
     env = [] if args.env is None else ["--env", args.env]
     wants_help = bool({"-h", "--help"} & set(rest))
-    if wants_help:
+    program = "sb3-htr optimize" if "-optimize" in rest else "sb3-htr train"
+    if wants_help and "-optimize" not in rest:
         print(HELP)
     if args.algo != "pearl":
         raise ValueError(f"--algo is {args.algo!r}, but sb3-htr trains pearl: `python -m rl_zoo3.train` has SB3's algorithms.")
@@ -90,7 +91,7 @@ def main(argv: Sequence[str]) -> None:
         find_hidden(args.env or "")
     keep_freed_memory()
     try:
-        run_rl_zoo("sb3-htr train", arguments, args.method, run, args.trust)
+        run_rl_zoo(program, arguments, args.method, run, args.trust)
     except (NameError, SyntaxError) as error:
         raise ValueError(
             f"{error}: the values of -params and --env-kwargs are Python, with strings in quotes, as in \"explorer:'prior'\"."

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import shutil
 import signal
 import sys
 import threading
@@ -63,6 +64,7 @@ class MetaExperimentManager(ExperimentManager):
         self._method_name = method
         self._unique = kwargs.get("uuid_str", "")
         self.resumed = resumed
+        self._claimed: Path | None = None
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """
@@ -150,6 +152,17 @@ class MetaExperimentManager(ExperimentManager):
         )
         return env if self.vec_env_wrapper is None else self.vec_env_wrapper(env)
 
+    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
+        """
+        :return: the model and its hyperparameters; None for a search
+        """
+        try:
+            return super().setup_experiment()
+        except BaseException:
+            if self._claimed is not None:  # nothing was trained in it
+                shutil.rmtree(self._claimed)
+            raise
+
     def create_log_folder(self) -> None:
         """Make the run's folder, or take the one of the run that goes on; a search has none."""
         self.log_path = f"{self.log_folder}/{self.method.name}/"
@@ -160,8 +173,9 @@ class MetaExperimentManager(ExperimentManager):
         if self.resumed is None:
             # An env that cannot be trained on should say so before there is a folder
             make_task_vec_env(self.env_name.gym_id, env_kwargs=self.env_kwargs, wrapper=self.env_wrapper).close()
-            self.save_path = str(claim(self.log_path, self.env_name, self._unique))
-            self._lock = lock(Path(self.save_path))
+            self._claimed = claim(self.log_path, self.env_name, self._unique)
+            self.save_path = str(self._claimed)
+            self._lock = lock(self._claimed)
         else:
             self.save_path = str(self.resumed)
             self._lock = lock(self.resumed)
@@ -316,7 +330,7 @@ def run_rl_zoo(
             "CheckpointCallback": CheckpointCallback,
             "ProgressBarCallback": MetaProgressBarCallback,
         },
-        rl_zoo3.train: {"ExperimentManager": manager},
+        rl_zoo3.train: {"ExperimentManager": manager, "ALGOS": {"pearl": PEARL}},
     }
     for module, classes in replaced.items():
         vars(module).update(classes)
