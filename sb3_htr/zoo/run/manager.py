@@ -231,9 +231,11 @@ class MetaExperimentManager(ExperimentManager):
         try:
             super().save_trained_model(model)
         except WRITE_ERRORS as error:
+            again = f"`sb3-htr train --resume {self.save_path}` goes on from the last checkpoint"
+            if not checkpoints(Path(self.save_path)):
+                again = "train again, as there is no checkpoint either"
             raise OSError(
-                f"The last model could not be written to {self.save_path} ({reason(error)}): free some space, and "
-                f"`sb3-htr train --resume {self.save_path}` goes on from the last checkpoint."
+                f"The last model could not be written to {self.save_path} ({reason(error)}): mend that, and {again}."
             ) from error
 
     def objective(self, trial: optuna.Trial) -> float:
