@@ -96,6 +96,34 @@ def test_a_finished_run_says_so(unbroken: Path, capsys: pytest.CaptureFixture[st
     assert before == {path: path.stat().st_mtime_ns for path in unbroken.rglob("*")}
 
 
+def test_training_further_is_as_if_it_had_been_planned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for folder, planned in (("at_once", "960"), ("further", "480")):
+        arguments = [word if word != str(STEPS) else planned for word in TRAIN]
+        assert main([*arguments, "learning_rate:1e-3", "-f", str(tmp_path / folder)]) == 0
+    at_once, run = (run_folder(tmp_path / folder) for folder in ("at_once", "further"))
+    assert main(["train", "--resume", str(run), "-n", "480"]) == 0
+    ours, theirs = parameters(run), parameters(at_once)
+    assert all(th.equal(ours[name], theirs[name]) for name in theirs)
+    record = json.loads((run / "run.json").read_text())
+    assert record["n_timesteps"] == record["hyperparams"]["n_timesteps"] == 960
+    capsys.readouterr()
+    assert main(["train", "--resume", str(run)]) == 0
+    assert f"{run} is finished, after 960 env steps. To train further: sb3-htr train --resume" in capsys.readouterr().out
+
+
+def test_a_learning_rate_decays_anew_when_training_further(tmp_path: Path) -> None:
+    arguments = [word if word != str(STEPS) else "720" for word in TRAIN]
+    assert main([*arguments, "learning_rate:'lin_1e-3'", "-f", str(tmp_path)]) == 0
+    run = run_folder(tmp_path)
+    assert main(["train", "--resume", str(run), "-n", "720"]) == 0
+    progress = np.genfromtxt(run / "progress.csv", delimiter=",", names=True, deletechars="")
+    steps, rates = progress["time/total_timesteps"], progress["train/learning_rate"]
+    # A row is logged before the updates of its rollout, and has the rate of those of the rollout before
+    steps, rates = steps[np.isfinite(rates)] - 240, rates[np.isfinite(rates)]
+    assert len(rates) >= 4
+    np.testing.assert_allclose(rates, 1e-3 * (1 - steps / np.where(steps <= 720, 720, 1440)), rtol=1e-6, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     "settings",
     [
