@@ -1,5 +1,6 @@
 """What users of Stable-Baselines3 rely on in any algorithm."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from stable_baselines3.common.logger import configure
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL
 from helpers import parameters as all_parameters
+from sb3_htr import PEARL
 from sb3_htr.common.vec_env import make_task_vec_env
 
 
@@ -55,6 +57,22 @@ def test_training_goes_on_without_resetting_the_count(tiny_pearl: MakePEARL) -> 
     assert model.num_timesteps == 3 * ROLLOUT and model._episode_num > episodes and model._n_updates > updates
     model.learn(ROLLOUT)
     assert model.num_timesteps == ROLLOUT
+
+
+def test_a_model_that_goes_on_without_its_experience_says_so(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    model = tiny_pearl().learn(2 * ROLLOUT)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = PEARL.load(tmp_path / "model", env=make_task_vec_env(ENV_ID, 4))
+    with pytest.warns(UserWarning, match="The experience that this model was trained on is not there.*load_replay_buffer"):
+        loaded.learn(ROLLOUT)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        whole = PEARL.load(tmp_path / "model", env=make_task_vec_env(ENV_ID, 4))
+        whole.load_replay_buffer(tmp_path / "buffer")
+        whole.learn(ROLLOUT)
+        model.learn(ROLLOUT)
+        tiny_pearl().learn(2 * ROLLOUT)
 
 
 def test_sb3s_callbacks_work(tiny_pearl: MakePEARL, tmp_path: Path) -> None:

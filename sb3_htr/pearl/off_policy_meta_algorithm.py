@@ -226,6 +226,13 @@ class OffPolicyMetaAlgorithm(SAC):
         return shown
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        assert self.replay_buffer is not None
+        if self._n_updates > 0 and self.replay_buffer.size() == 0:
+            warnings.warn(
+                "The experience that this model was trained on is not there, so it goes on with new episodes alone: "
+                "load_replay_buffer brings back what save_replay_buffer has saved.",
+                stacklevel=3,
+            )
         result = super()._setup_learn(*args, **kwargs)
         if self._pending_random is not None:
             self._set_random_state(self._pending_random)
