@@ -1,5 +1,6 @@
 """What users of Stable-Baselines3 rely on in any algorithm."""
 
+import copy
 import warnings
 from pathlib import Path
 from typing import Any
@@ -73,6 +74,17 @@ def test_a_model_that_goes_on_without_its_experience_says_so(tiny_pearl: MakePEA
         whole.learn(ROLLOUT)
         model.learn(ROLLOUT)
         tiny_pearl().learn(2 * ROLLOUT)
+
+
+@pytest.mark.parametrize("env", [ENV_ID, "one env"])
+def test_a_deep_copy_learns_on_its_own(env: str, tiny_pearl: MakePEARL) -> None:
+    settings = {} if env == ENV_ID else {"n_tasks_per_rollout": 1}
+    model = tiny_pearl(ENV_ID if env == ENV_ID else gym.make(ENV_ID), **settings).learn(ROLLOUT)
+    twin, before = copy.deepcopy(model), all_parameters(model)
+    twin.learn(2 * ROLLOUT, reset_num_timesteps=False)
+    assert twin.num_timesteps == 3 * ROLLOUT and model.num_timesteps == ROLLOUT
+    assert all(th.equal(value, before[name]) for name, value in all_parameters(model).items())
+    assert any(not th.equal(value, before[name]) for name, value in all_parameters(twin).items())
 
 
 def test_sb3s_callbacks_work(tiny_pearl: MakePEARL, tmp_path: Path) -> None:

@@ -88,6 +88,23 @@ def test_records(change: Callable[[str], dict[str, Any]], fuse: Path, tmp_path: 
         assert not fuse.exists(), f"sb3-htr {command[0]} ran it"
 
 
+def test_modules_that_a_record_asks_for_are_imported_if_the_user_names_them(
+    fuse: Path, tmp_path: Path, tiny_pearl: MakePEARL
+) -> None:
+    run = make_run(tmp_path / "logs", tiny_pearl(), gym_packages=["evil"])
+    look = ["enjoy", str(run), "--no-render", "--n-episodes", "1", "--n-tasks", "1"]
+    with pytest.raises(
+        ValueError, match=r"best_model\.zip asks for the module 'evil'.* add --gym-packages evil if you know it"
+    ):
+        main(look)
+    assert not fuse.exists()
+    for said in (["--gym-packages", "evil"], ["--trust"]):
+        sys.modules.pop("evil", None)
+        assert main([*look, *said]) == 0
+        assert fuse.exists()
+        fuse.unlink()
+
+
 # --- YAML files
 
 BLOCK: dict[str, Any] = {"policy": "MlpPolicy", "n_timesteps": 100, "n_envs": 2}

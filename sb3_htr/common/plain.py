@@ -17,13 +17,17 @@ def load_plain(file: str | os.PathLike[str] | IO[bytes]) -> Any:
 
     :param file: of ``torch.save``
     :return: nested dicts, lists and tuples of tensors, numbers, strings, None
-    :raises ValueError: for a file that unpacks to too much, or whose tensors are larger than what is stored of them
+    :raises ValueError: for a file that is not what was written, that unpacks to too much, or whose tensors are larger than
+        what is stored of them
     :raises Exception: of many kinds, for a file that is damaged or of another kind
     """
     with zipfile.ZipFile(file) as archive:
         size = sum(info.file_size for info in archive.infolist())
-    if size > MAX_BYTES:
-        raise ValueError(f"it unpacks to more than {MAX_BYTES} bytes.")
+        if size > MAX_BYTES:
+            raise ValueError(f"it unpacks to more than {MAX_BYTES} bytes.")
+        # torch does not look at the checksums
+        if archive.testzip() is not None:
+            raise ValueError("it is not what was written.")
     if not isinstance(file, str | os.PathLike):
         file.seek(0)
     content = th.load(file, map_location="cpu", weights_only=True)

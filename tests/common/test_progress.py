@@ -48,7 +48,7 @@ def test_progress_is_as_even_as_time(
     callback, bar = MetaProgressBarCallback(), Bar()
 
     def start() -> None:
-        callback.pbar = bar  # type: ignore[assignment]
+        callback.pbar = bar
 
     monkeypatch.setattr("stable_baselines3.common.callbacks.ProgressBarCallback._on_training_start", lambda _: start())
     monkeypatch.setattr("stable_baselines3.common.callbacks.ProgressBarCallback._on_training_end", lambda _: None)

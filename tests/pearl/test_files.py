@@ -4,12 +4,14 @@ import base64
 import io
 import json
 import pickle
+import random
 import threading
 import zipfile
 from pathlib import Path
 from typing import Any
 
 import cloudpickle  # type: ignore[import-untyped]
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -19,7 +21,7 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL, many
 from helpers.bombs import Bomb, bombs
-from sb3_htr import PEARL, evaluate_adaptation, load_untrusted
+from sb3_htr import PEARL, AdaptedAgent, evaluate_adaptation, load_untrusted
 from sb3_htr.adaptation import Belief, Prior
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr import EpisodeClustering
@@ -125,6 +127,37 @@ def test_truncated_files_are_refused(tiny_pearl: MakePEARL, tmp_path: Path, part
         load_untrusted(tmp_path / "model.zip", ENV_ID)
     with pytest.raises(ValueError, match="is damaged"):
         model.load_replay_buffer(tmp_path / "buffer.pt")
+
+
+def test_flipped_bits_are_noticed_or_harmless(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    """A hundred in each kind of file."""
+    model = tiny_pearl().learn(ROLLOUT)
+    agent = model.adapt(gym.make(ENV_ID), n_episodes=1)
+    model.save(tmp_path / "model.zip")
+    model.save_replay_buffer(tmp_path / "buffer.pt")
+    agent.save(tmp_path / "agent.pt")
+    assert model.replay_buffer is not None
+    rows, actor, places = model.replay_buffer.episodes.rows, model.policy.state_dict(), random.Random(0)
+    noticed = dict.fromkeys(("model.zip", "buffer.pt", "agent.pt"), 0)
+    for name in noticed:
+        whole = (tmp_path / name).read_bytes()
+        for _ in range(100):
+            damaged = bytearray(whole)
+            damaged[places.randrange(len(damaged))] ^= 1 << places.randrange(8)
+            (tmp_path / name).write_bytes(damaged)
+            try:
+                if name == "model.zip":  # which has more than is read here: states of optimizers
+                    weights = load_untrusted(tmp_path / name, ENV_ID).policy.state_dict()
+                    assert all(th.equal(weights[key], value) for key, value in actor.items())
+                elif name == "buffer.pt":
+                    model.load_replay_buffer(tmp_path / name)
+                    np.testing.assert_array_equal(model.replay_buffer.episodes.rows, rows)
+                else:
+                    weights = AdaptedAgent.load(tmp_path / name).policy.state_dict()
+                    assert all(th.equal(actor[key], value) for key, value in weights.items())
+            except ValueError:
+                noticed[name] += 1
+    assert min(noticed.values()) > 50
 
 
 def test_a_replay_buffer_of_other_settings_is_refused(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
