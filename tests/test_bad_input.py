@@ -11,7 +11,7 @@ from gymnasium import spaces
 from gymnasium.error import DependencyNotInstalled
 from hypothesis import given
 from hypothesis import strategies as st
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL, many
 from htr_envs import PointRobotEnv, PointRobotVectorEnv
@@ -81,6 +81,7 @@ def test_an_unknown_id_is_gymnasiums_business(tiny_pearl: MakePEARL) -> None:
         ({"kl_coef": -0.1}, "kl_coef is -0.1, expected a number of at least 0"),
         ({"gamma": 1.1}, "gamma is 1.1, expected a number from 0 to 1"),
         ({"tau": float("nan")}, "tau is nan"),
+        ({"tau": 0.0}, "tau is 0, with which the target critics would never learn"),
         ({"gradient_steps": 0}, "gradient_steps is 0"),
         ({"learning_starts": -1}, "learning_starts is -1"),
         ({"explorer": {"name": "prior", "n_exploration_episodes": -1}}, "n_exploration_episodes is -1"),
@@ -165,6 +166,82 @@ def test_episodes_of_one_step_are_episodes(tiny_pearl: MakePEARL) -> None:
     env = Changed(gym.make(ENV_ID), put(2, True))
     model = tiny_pearl(env, n_tasks_per_rollout=1, n_episodes_per_task=50).learn(200)
     assert model.replay_buffer is not None and model.replay_buffer.n_episodes.sum() == 200
+
+
+class Rewarded(gym.RewardWrapper[Any, Any]):
+    def reward(self, reward: Any) -> float:
+        return 2.0 * float(reward)
+
+
+class Paid(gym.Wrapper[Any, Any, Any, Any]):
+    """No kind of wrapper that is known to change rewards, and it changes those of successes alone."""
+
+    def step(self, action: Any) -> Any:
+        obs, reward, *others = self.env.step(action)
+        return obs, 2.0 * float(reward), *others
+
+
+def wrapped(wrapper: Any, **kwargs: Any) -> DummyVecEnv:
+    return DummyVecEnv([lambda: wrapper(gym.make(ENV_ID, **kwargs))] * 4)
+
+
+# Goals that a random agent comes across
+NEAR = {"goal_distance": 0.3}
+CHANGED = [
+    (lambda: wrapped(Rewarded, **NEAR), "in gymnasium's RewardWrapper, which changes its rewards"),
+    (lambda: wrapped(Paid, **NEAR), "The env gave .* but its compute_reward gives"),
+    (lambda: make_task_vec_env(ENV_ID, 4, env_kwargs={**NEAR, "reward_type": "dense"}), "reward_type is not 'sparse'"),
+    (lambda: make_task_vec_env(ENV_ID, 4, env_kwargs={"goal_distance": 0.5}), "another task family: its goal_distance is 0.5"),
+    (lambda: VecMonitor(VecNormalize(make_task_vec_env(ENV_ID, 4, env_kwargs=NEAR))), "VecNormalize stands between"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), CHANGED)
+@pytest.mark.parametrize("how", ["set_env", "load and replay", "load"])
+def test_wrong_rewards_are_refused_whenever_they_come_in(
+    how: str, change: Callable[[], Any], message: str, tiny_pearl: MakePEARL, tmp_path: Path
+) -> None:
+    model = tiny_pearl(make_task_vec_env(ENV_ID, 4, env_kwargs=NEAR)).learn(ROLLOUT)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    if how == "load" and "family" in message:
+        # Nothing was collected, and so another family is a new beginning
+        loaded = PEARL.load(tmp_path / "model", env=change())
+        assert loaded.replay_buffer is not None and vars(loaded.replay_buffer.task_family)["goal_distance"] == 0.5
+        return
+    with pytest.raises(ValueError, match=message):
+        if how == "set_env":
+            model.set_env(change())
+        else:
+            model = PEARL.load(tmp_path / "model", env=change())
+            if how == "load and replay":
+                model.load_replay_buffer(tmp_path / "buffer")
+        model.learn(10 * ROLLOUT, reset_num_timesteps=False)
+
+
+def test_another_family_replaces_the_one_of_which_nothing_was_collected(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    model.set_env(make_task_vec_env(ENV_ID, 4, env_kwargs={"goal_distance": 3.0}))
+    model.learn(ROLLOUT)
+    assert model.replay_buffer is not None and model.task_bank is not None
+    for family in (model.replay_buffer.task_family, model.task_bank.task_family):
+        assert vars(family)["goal_distance"] == 3.0
+
+
+class FarAway(gym.ObservationWrapper[Any, Any, Any]):
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+
+    def observation(self, observation: Any) -> Any:
+        return (observation + 1e5).astype(np.float32)
+
+
+@pytest.mark.filterwarnings("ignore:The posterior")
+@pytest.mark.parametrize("seed", range(3))
+def test_observations_may_be_large(seed: int, tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl(FarAway(gym.make(ENV_ID)), n_tasks_per_rollout=1, seed=seed, gradient_steps=10).learn(300)
+    assert np.isfinite(model.knowledge.sample_aggregate(5, 1.0)).all()
 
 
 def test_a_time_limit_around_an_env_is_one(tiny_pearl: MakePEARL) -> None:

@@ -15,7 +15,7 @@ from stable_baselines3.common.logger import configure
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL
 from helpers import parameters as all_parameters
-from sb3_htr import PEARL
+from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.common.vec_env import make_task_vec_env
 
 
@@ -85,6 +85,13 @@ def test_a_deep_copy_learns_on_its_own(env: str, tiny_pearl: MakePEARL) -> None:
     assert twin.num_timesteps == 3 * ROLLOUT and model.num_timesteps == ROLLOUT
     assert all(th.equal(value, before[name]) for name, value in all_parameters(model).items())
     assert any(not th.equal(value, before[name]) for name, value in all_parameters(twin).items())
+
+
+def test_an_evaluation_leaves_numpys_generator_alone(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    before = np.random.get_state(legacy=False)
+    evaluate_adaptation(model, ENV_ID, n_episodes=1)
+    np.testing.assert_equal(np.random.get_state(legacy=False), before)
 
 
 def test_sb3s_callbacks_work(tiny_pearl: MakePEARL, tmp_path: Path) -> None:

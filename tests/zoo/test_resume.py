@@ -23,6 +23,7 @@ from sb3_htr import PEARL
 from sb3_htr.common.checkpoint import write_checkpoint
 from sb3_htr.common.resume import checkpoints
 from sb3_htr.zoo.cli import main
+from sb3_htr.zoo.run.shipped import hyperparams_file
 
 # Rollouts of 4 tasks x 3 episodes x 20 steps, 10 of them, a checkpoint after each
 STEPS = 2400
@@ -158,6 +159,19 @@ def test_tensorboard_shows_each_point_once(tmp_path: Path) -> None:
     shutil.rmtree(checkpoints(run)[0])
     assert main(["train", "--resume", str(run)]) == 0
     assert [points(name) for name in names] == before
+
+
+def test_a_run_goes_on_from_another_folder_than_it_was_begun_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "there").mkdir()
+    monkeypatch.chdir(tmp_path / "there")
+    shutil.copy(hyperparams_file(), "my.yml")
+    arguments = [word if word != str(STEPS) else "480" for word in TRAIN]
+    assert main([*arguments, "-conf", "my.yml", "-f", "runs"]) == 0
+    run = run_folder(Path("runs").resolve())
+    (run / f"{ENV_ID}.zip").unlink()
+    monkeypatch.chdir(tmp_path)
+    assert main(["train", "--resume", str(run)]) == 0
+    assert (run / f"{ENV_ID}.zip").exists()
 
 
 def test_the_last_one_cleans_up(unbroken: Path, tmp_path: Path) -> None:
