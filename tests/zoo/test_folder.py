@@ -51,6 +51,8 @@ def test_runs_that_begin_at_once_take_different_numbers(tmp_path: Path) -> None:
 def test_a_number_is_never_given_twice(tmp_path: Path) -> None:
     assert [claim(str(tmp_path), ENV_ID, "").name for _ in range(2)] == [f"{ENV_ID}_1", f"{ENV_ID}_2"]
     (tmp_path / f"{ENV_ID}_7").mkdir()
+    for name in ("²", "x", "9x", ""):
+        (tmp_path / f"{ENV_ID}_{name}").mkdir()
     assert claim(str(tmp_path), ENV_ID, "_unique").name == f"{ENV_ID}_8_unique"
 
 
