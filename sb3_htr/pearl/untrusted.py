@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import re
 import zipfile
 from typing import Any
 
@@ -21,20 +22,13 @@ MAX_LAYERS, MAX_UNITS = 16, 2**14
 EXPLORERS = ("explorer", "train_explorer")
 # Of an object, SB3 writes its plain attributes beside its type and its pickle
 TYPE, PICKLED = ":type:", ":serialized:"
-# Numbers among the arguments of PEARL that take no memory, and counters
+# Arguments of PEARL that are numbers and take no memory, those that may be words, and counters
 NUMBERS = (
-    *(
-        "learning_rate",
-        "learning_starts",
-        "batch_size",
-        "tau",
-        "gamma",
-        "gradient_steps",
-        "ent_coef",
-        "target_update_interval",
-    ),
-    *("meta_batch_size", "context_size", "kl_coef", "n_tasks_per_rollout", "n_episodes_per_task"),
+    *("learning_rate", "learning_starts", "batch_size", "tau", "gamma", "gradient_steps", "ent_coef", "target_entropy"),
+    *("target_update_interval", "meta_batch_size", "context_size", "kl_coef", "reward_coef"),
+    *("n_tasks_per_rollout", "n_episodes_per_task"),
 )
+WORDS = {"ent_coef": r"auto(_\d+(\.\d+)?)?", "target_entropy": "auto", "matmul_precision": "highest|high|medium"}
 COUNTERS = ("num_timesteps", "_n_updates")
 # Arguments of the replay buffer that are plain data
 REPLAY = ("relabel_probability", "relabeller", "rl_reward_type", "context_episodes")
@@ -46,9 +40,10 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
     weights take.
 
     SB3's ``load`` unpickles what is no plain JSON in the file, and a pickle can run anything. This function reads the sizes of
-    the networks, the explorers, the relabeller and their settings, a linear schedule, and plain numbers; it makes a new model
-    with them and fills in the weights. Other schedules, a relabeller that is an object and a replay buffer of one's own, which
-    only training needs, are left at their defaults.
+    the networks, the explorers, the relabeller and their settings, a linear schedule, and plain numbers and words; it makes a
+    new model with them and fills in the weights. What only training needs is left at its default where it is no plain data:
+    other schedules, a relabeller that is an object, a replay buffer of one's own. An entropy coefficient that is learnt begins
+    anew.
 
     :param path: file of ``PEARL.save``
     :param env: env of the same spaces; its spaces are not read from the file
@@ -61,6 +56,7 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
         data, weights = _read(path)
         settings: dict[str, Any] = {name: _plain(data[name]) for name in EXPLORERS}
         settings |= {name: data[name] for name in NUMBERS if type(data.get(name)) in (int, float)}
+        settings |= {name: data[name] for name, words in WORDS.items() if re.fullmatch(words, str(data.get(name)))}
         settings |= _schedule(data.get("learning_rate"))
         replay = data.get("replay_buffer_kwargs")
         replay = replay if isinstance(replay, dict) else {}

@@ -1,10 +1,12 @@
 """Files from strangers and damaged ones: nothing of them runs, and one sentence says what is wrong."""
 
 import base64
+import inspect
 import io
 import json
 import pickle
 import random
+import re
 import threading
 import zipfile
 from pathlib import Path
@@ -25,6 +27,7 @@ from sb3_htr import PEARL, AdaptedAgent, evaluate_adaptation, load_untrusted
 from sb3_htr.adaptation import Belief, Prior
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr import EpisodeClustering
+from sb3_htr.pearl.untrusted import NUMBERS, WORDS
 
 
 def repack(source: Path, target: Path, changed: dict[str, bytes]) -> None:
@@ -96,6 +99,9 @@ def test_an_untrusted_model_acts_as_the_one_that_was_saved(tiny_pearl: MakePEARL
     assert load_untrusted(tmp_path / "model.zip", ENV_ID, explorer="prior").explorer == Prior()
     for a, b in zip(evaluate_adaptation(model, ENV_ID), evaluate_adaptation(loaded, ENV_ID), strict=True):
         np.testing.assert_array_equal(a, b)
+    tiny_pearl(ent_coef="auto_0.3", target_entropy=-1.5, matmul_precision="medium").save(tmp_path / "words.zip")
+    words = load_untrusted(tmp_path / "words.zip", ENV_ID)
+    assert (words.ent_coef, words.target_entropy, words.matmul_precision) == ("auto_0.3", -1.5, "medium")
     # What is pickled is left away
     tiny_pearl(learning_rate=lambda _: 1.0, replay_buffer_kwargs={"relabeller": EpisodeClustering(0.2)}).save(
         tmp_path / "own.zip"
@@ -104,6 +110,15 @@ def test_an_untrusted_model_acts_as_the_one_that_was_saved(tiny_pearl: MakePEARL
     assert own.learning_rate == 1e-3 and own.replay_buffer_kwargs == {}
     with pytest.raises(ValueError, match="do not fit the env or the settings"):
         load_untrusted(tmp_path / "model.zip", "SparseTargetSpeed-v0", policy_kwargs={"latent_dim": 7})
+
+
+def test_no_plain_setting_of_pearl_is_forgotten() -> None:
+    """Those that are left out take memory, or are the user's."""
+    for name, parameter in inspect.signature(PEARL).parameters.items():
+        if type(parameter.default) in (int, float) and name not in ("buffer_size", "stats_window_size", "verbose"):
+            assert name in NUMBERS, name
+        if isinstance(parameter.default, str) and name not in ("explorer", "train_explorer", "device"):
+            assert re.fullmatch(WORDS[name], parameter.default), name
 
 
 @many

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.utils import LinearSchedule
 
 import sb3_htr
 from helpers import ENV_ID, MakePEARL, with_policy
@@ -76,7 +77,11 @@ def test_agents_that_are_not_there_are_said_to_be_so(tmp_path: Path, tiny_pearl:
 
 
 def test_export_is_small_exact_and_plain(run: Path, tmp_path: Path, tiny_pearl: MakePEARL) -> None:
-    model = tiny_pearl(tensorboard_log=str(tmp_path / "secret"))
+    schedule, replay = (
+        LinearSchedule(1e-3, 0.0, 1.0),
+        {"relabel_probability": 0.3, "relabeller": {"name": "EpisodeClustering"}},
+    )
+    model = tiny_pearl(tensorboard_log=str(tmp_path / "secret"), learning_rate=schedule, replay_buffer_kwargs=replay)
     model.learn(500)
     model.save(run / "best_model.zip")
     file = tmp_path / "agent.zip"
@@ -93,6 +98,8 @@ def test_export_is_small_exact_and_plain(run: Path, tmp_path: Path, tiny_pearl: 
         for ours, theirs in zip(expected, record_adaptation(loaded, ENV_ID, n_episodes=3), strict=True):
             np.testing.assert_array_equal(ours, theirs)
     assert exported.num_timesteps == model.num_timesteps and exported.gamma == model.gamma
+    for loaded in (exported, untrusted):
+        assert str(loaded.learning_rate) == str(schedule) and loaded.replay_buffer_kwargs == replay
     # A start for a training of one's own
     exported = PEARL.load(file, env=model.env)
     exported.learn(500)
