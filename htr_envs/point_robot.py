@@ -67,7 +67,7 @@ class PointRobotDynamics(Dynamics[PointRobotFamily]):
         canvas.disc(task, radius, ORANGE if reached else PALE_ORANGE)
         canvas.circle(task, radius, 2, ORANGE)
         canvas.path(path)
-        canvas.legend([("hidden goal", ORANGE), ("start", None), ("robot", BLUE)])
+        canvas.legend([("goal, hidden from the agent", ORANGE), ("start", None), ("robot", BLUE)])
         return canvas.image()
 
 
@@ -146,7 +146,7 @@ class PointRobotEnv(DynamicsEnv):
     | `task_seed`          | `1337`     | seed of the task sets, apart from the run's seed                  |
     | `held_out`           | `None`     | degrees (from, to): no training tasks, all others                 |
     | `reward_type`        | `"sparse"` | reward of `step`, `"sparse"` or `"dense"`                         |
-    | `render_mode`        | `None`     | `"rgb_array"` for pictures                                        |
+    | `render_mode`        | `None`     | `"rgb_array"` for pictures, `"human"` for a window                |
 
     `reset(options={"task_id": i})` or `reset(options={"task": [x, y]})` gives the env a task, which stays until it is changed.
 

@@ -151,7 +151,7 @@ class TargetSpeedDynamics(Dynamics[TargetSpeedFamily]):
         canvas.circle((0.0, 0.0), speed, 2 * tolerance / canvas.pixel, ORANGE if held else PALE_ORANGE)
         canvas.axes()
         canvas.path(path)
-        canvas.legend([("hidden target speed", ORANGE), ("start", None), ("sledge", BLUE)])
+        canvas.legend([("target speed, hidden from the agent", ORANGE), ("start", None), ("sledge", BLUE)])
         return canvas.image()
 
 
@@ -226,7 +226,7 @@ class TargetSpeedEnv(DynamicsEnv):
     | `n_validation_tasks` | `20`       | number of validation tasks                                        |
     | `task_seed`          | `1337`     | seed of the task sets, apart from the run's seed                  |
     | `reward_type`        | `"sparse"` | reward of `step`, `"sparse"` or `"dense"`                         |
-    | `render_mode`        | `None`     | `"rgb_array"` for pictures of the plane of velocities             |
+    | `render_mode`        | `None`     | `"rgb_array"` for pictures of velocities, `"human"` for a window  |
 
     `reset(options={"task_id": i})` or `reset(options={"task": [speed]})` gives the env a task, which stays until it
     is changed.

@@ -317,10 +317,9 @@ def test_what_cannot_be_trained_is_refused_in_one_sentence(
 
 def test_only_the_envs_of_a_model_can_be_adapted_to(tiny_pearl: MakePEARL) -> None:
     model = tiny_pearl()
-    with pytest.raises(ValueError, match="The env has no task_family"):
-        model.adapt(gym.make("CartPole-v1"))
-    with pytest.raises(ValueError, match="spaces do not match"):
-        model.adapt(gym.make("SparseTargetSpeed-v0"))
+    for other in ("CartPole-v1", "SparseTargetSpeed-v0"):
+        with pytest.raises(ValueError, match="spaces do not match"):
+            model.adapt(gym.make(other))
 
 
 numbers = st.one_of(st.integers(-3, 300), st.floats(-2, 2), st.just(float("nan")), st.just(float("inf")))

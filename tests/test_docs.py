@@ -5,7 +5,10 @@ import runpy
 import shlex
 from pathlib import Path
 
+import agents_table
+import env_pages
 import pytest
+from tables import filled
 
 from helpers.runs import SMALL
 from sb3_htr.zoo.cli import main
@@ -25,10 +28,38 @@ PAGES = [path for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.m
 @pytest.mark.filterwarnings("ignore:No reward was found")
 def test_the_code_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    # The README trains for minutes; here it is for a moment
-    code = python_blocks(page).replace("model.learn()", "model.learn(8000)")
+    # For a moment, where the page trains for seconds or minutes
+    code = python_blocks(page).replace("model.learn()", "model.learn(8000)").replace("gradient_steps=100", "gradient_steps=5")
+    code = code.replace(
+        'PEARL("MlpPolicy", "SparsePointRobot-v0"', 'PEARL("MlpPolicy", "SparsePointRobot-v0", gradient_steps=5'
+    )
     (tmp_path / "page.py").write_text(code)
     runpy.run_path("page.py", run_name="__main__")
+
+
+def test_pages_can_be_read_where_they_are_not_built() -> None:
+    """Blocks that only Sphinx understands are kept out of what is read on the web page of the repository."""
+    for page in ROOT.glob("docs/**/*.md"):
+        only_sphinx = {"eval-rst", "include"} & set(re.findall(r"^```\{([a-z-]+)\}", page.read_text(), flags=re.MULTILINE))
+        assert not only_sphinx or page.parent.name == "api", page
+
+
+def test_links_and_pictures_are_there() -> None:
+    for page in (*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("trained_agents/*.md")):
+        for target in re.findall(r"\]\(([^)#\s]+)", page.read_text()):
+            assert target.startswith("https://") or (page.parent / target).exists(), f"{page}: {target}"
+
+
+@pytest.mark.parametrize("page", env_pages.ENVS)
+def test_pages_of_envs_say_what_the_docstrings_say(page: str) -> None:
+    text = (env_pages.PAGES / f"{page}.md").read_text()
+    assert text == filled(text, env_pages.tables(env_pages.ENVS[page])), "run python tools/env_pages.py"
+
+
+def test_the_table_of_agents_is_that_of_the_files() -> None:
+    text = (agents_table.AGENTS / "README.md").read_text()
+    scores = agents_table.read_scores()
+    assert text == filled(text, {"agents": agents_table.table(scores)}), "run python tools/agents_table.py"
 
 
 def test_the_tests_that_repeat_a_figure_are_there() -> None:

@@ -25,7 +25,9 @@ from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.adaptation import Belief, Explorer, Step
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
 from sb3_htr.experiments import grid, report
+from sb3_htr.experiments.cell import Evaluation
 from sb3_htr.experiments.grid import Experiment, Variant
+from sb3_htr.experiments.runner import run_cell
 from sb3_htr.htr import Relabeller
 from sb3_htr.htr.relabel import RELABELLERS, HindsightDraw
 from sb3_htr.zoo.cli import main
@@ -301,9 +303,18 @@ def heights() -> Iterator[str]:
     del gym.registry["SparseHeights-v0"]
 
 
+# Enough for a family of one's own
+LEARNS: dict[str, Any] = {
+    "gradient_steps": 100,
+    "meta_batch_size": 32,
+    "batch_size": 16,
+    "policy_kwargs": {"net_arch": [64, 64], "encoder_arch": [64, 64], "latent_dim": 3},
+}
+
+
 def test_an_env_family(heights: str, tiny_pearl: MakePEARL) -> None:
     check_task_env(gym.make(heights))
-    model = tiny_pearl(heights, gradient_steps=20).learn(4 * 4 * 3 * 25)
+    model = tiny_pearl(heights, seed=1, **LEARNS).learn(8 * 4 * 3 * 25)
     assert model.env is not None and isinstance(model.env.unwrapped, BatchedTaskVecEnv), "its batched env is used"
     buffer = model.replay_buffer
     assert buffer is not None and isinstance(buffer.task_family, Heights) and buffer.max_episode_steps == 25
@@ -329,15 +340,20 @@ def test_an_experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[str] = []
     tiny = {**yaml.safe_load("{n_envs: 4, learning_starts: 240}"), **{key: TINY[key] for key in TINY if key != "seed"}}
     row = Variant("htr-ser", "sharp", {**tiny, "explorer": {"margin": 0.7}})
-    experiment = Experiment("A toy.", ENV_ID, 960, (row,), 1, 480, explorers=("aggregate",), figure=figure)
-    monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 50)
+    experiment = Experiment(
+        "toy", "A toy.", ENV_ID, 960, (row,), 1, 480, evaluations=(Evaluation("aggregate", {}),), figure=figure
+    )
+    monkeypatch.setattr("sb3_htr.experiments.protocol.EVAL_SEEDS", (1,))
     monkeypatch.setitem(grid.EXPERIMENTS, "toy", experiment)
     runs, results = tmp_path / "runs", tmp_path / "results"
-    report.run("toy", "python toy.py", experiment, experiment.cells(), runs, results, 1)
+    runs.mkdir()
+    (cell,) = experiment.cells()
+    assert run_cell(cell, runs)
+    report.write("python toy.py", experiment, {cell: cell.result(runs)}, results)
     assert drawn == ["sharp"] and (results / "toy.png").exists()
     summary = json.loads((results / "summary.json").read_text())
     assert [row["variant"] for row in summary["rows"] if row["metric"] == "success_rate"] == drawn
-    agent = agent_at(runs / experiment.cells()[0].name)
+    agent = agent_at(cell.run_folder(runs))
     assert agent.method == "htr-ser" and agent.load().explorer == Belief(margin=0.7)
 
 

@@ -15,4 +15,4 @@ def test_it_learns_to_find_and_hold_unseen_goals_from_sparse_rewards() -> None:
     assert returns[:, -1].mean() > 9
     assert successes[:, -1].mean() > 0.6
     # It adapts: the last episodes are better than the first
-    assert returns[:, -1].mean() > 2 * returns[:, 0].mean()
+    assert returns[:, -1].mean() > returns[:, 0].mean() + 2

@@ -22,7 +22,14 @@ from sb3_htr.common.vec_env import make_task_vec_env
 def test_parameters_can_be_read_and_set(tiny_pearl: MakePEARL) -> None:
     model, other = tiny_pearl().learn(2 * ROLLOUT), tiny_pearl(seed=5)
     parameters: dict[str, Any] = model.get_parameters()
-    assert set(parameters) == {"policy", "knowledge", "actor.optimizer", "critic.optimizer", "encoder.optimizer"}
+    assert set(parameters) == {
+        "policy",
+        "knowledge",
+        "actor.optimizer",
+        "critic.optimizer",
+        "encoder.optimizer",
+        "reward_model.optimizer",
+    }
     other.set_parameters(parameters)
     for name, value in all_parameters(model).items():
         assert th.equal(value, all_parameters(other)[name]), name

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_htr.common.atomic import atomic_path
+from sb3_htr.experiments.protocol import MIN_RUNS
 
 RESULTS = Path(__file__).parents[1] / "results"
 DOCUMENTS = (RESULTS.parent / "README.md", RESULTS.parent / "docs" / "results.md", RESULTS.parent / "docs" / "performance.md")
@@ -24,21 +25,32 @@ def table(summary: dict[str, Any]) -> str:
     :param summary: content of a ``summary.json``
     :return: Markdown table, one line per env argument, method and explorer
     """
+    rows = summary["rows"]
     lines: dict[tuple[str, ...], dict[str, str]] = {}
-    settings = sorted({key for row in summary["rows"] for key in row["env_kwargs"]})
-    for row in summary["rows"]:
-        key = (*(str(row["env_kwargs"][setting]) for setting in settings), row["variant"], row["explorer"])
+    settings = sorted({key for row in rows for key in row["env_kwargs"]})
+    has_places = any(row.get("tested_on") for row in rows)
+    for row in rows:
+        place = [_place(row)] if has_places else []
+        key = (*(str(row["env_kwargs"][setting]) for setting in settings), row["variant"], f"`{row['explorer']}`", *place)
         lines.setdefault(key, {})[row["metric"]] = f"{row['iqm']:.2f} [{row['low']:.2f}, {row['high']:.2f}]"
-    first = summary["rows"][0]
-    head = [*(setting.replace("_", " ") for setting in settings), "method", "explorer", *COLUMNS.values()]
+    settings = [setting.replace("_", " ") for setting in settings]
+    head = [*settings, "method", "explorer", *["tested on"] * has_places, *COLUMNS.values()]
     body = [[*key, *(cells[metric] for metric in COLUMNS)] for key, cells in lines.items()]
-    env_steps = " / ".join(f"{n:,}" for n in sorted({row["env_steps"] for row in summary["rows"]}))
+    env_steps = " / ".join(f"{n:,}" for n in sorted({row["env_steps"] for row in rows}))
+    n_runs = min(row["n_seeds"] for row in rows)
+    few = f", **fewer than the {MIN_RUNS} that a claim needs**" if n_runs < MIN_RUNS else ""
+    about = f"{rows[0]['env']}, {env_steps} env steps, {n_runs} runs{few}."
     text = "\n".join("| " + " | ".join(line) + " |" for line in (head, ["---"] * len(head), *body))
     return (
-        f"{text}\n\n{first['env']}, {env_steps} env steps, {first['n_seeds']} seeds, IQM and 95 % stratified "
-        f"bootstrap interval, final models on the test tasks. `{summary['command']}`, commit {summary['commit']}, "
-        f"{summary['machine']}.\n"
+        f"{text}\n\n{about} Final models on the test tasks: IQM over runs, "
+        f"95 % bootstrap interval over runs, tasks and {summary.get('n_eval_seeds', 1)} evaluation seeds. "
+        f"`{summary['command']}`, commit {summary['commit']}, {summary['machine']}.\n"
     )
+
+
+def _place(row: dict[str, Any]) -> str:
+    """What env a model was tested on."""
+    return ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in row.get("tested_on", {}).items()) or "as in training"
 
 
 def headline(summaries: dict[str, dict[str, Any]]) -> str:
@@ -51,7 +63,7 @@ def headline(summaries: dict[str, dict[str, Any]]) -> str:
     for summary in (summaries[name] for name in ENVS if name in summaries):
         scores: dict[tuple[str, ...], dict[str, str]] = {}
         for row in summary["rows"]:
-            if row["variant"] in METHODS:
+            if row["variant"] in METHODS and not row.get("tested_on"):
                 key = (row["env"], f"{row['env_steps']:,}", str(row["n_seeds"]), row["variant"], f"`{row['explorer']}`")
                 scores.setdefault(key, {})[row["metric"]] = _interval(row)
         lines += [[*key, *(cells[metric] for metric in COLUMNS)] for key, cells in scores.items()]
@@ -64,20 +76,27 @@ def _interval(row: dict[str, Any]) -> str:
     return f"{row['iqm']:.1f} [{row['low']:.1f}, {row['high']:.1f}]"
 
 
+def filled(text: str, tables: dict[str, str]) -> str:
+    """
+    :param text: of a document
+    :param tables: what goes between ``<!-- NAME -->`` and ``<!-- end -->``, by name
+    :return: the document with it
+    """
+    for name, content in tables.items():
+        start, end = f"<!-- {name} -->\n", "<!-- end -->"
+        if start in text:
+            before, _, after = text.partition(start)
+            text = before + start + content + end + after.partition(end)[2]
+    return text
+
+
 def fill(documents: Iterable[Path], tables: dict[str, str]) -> None:
     """
-    Replace what stands between ``<!-- NAME -->`` and ``<!-- end -->``.
-
     :param documents: files to write
-    :param tables: what goes there, by name
+    :param tables: see :func:`filled`
     """
     for document in documents:
-        text = document.read_text()
-        for name, content in tables.items():
-            start, end = f"<!-- {name} -->\n", "<!-- end -->"
-            if start in text:
-                before, _, after = text.partition(start)
-                text = before + start + content + end + after.partition(end)[2]
+        text = filled(document.read_text(), tables)
         with atomic_path(document) as temporary:
             temporary.write_text(text)
 

@@ -13,6 +13,8 @@ from sb3_htr.common.type_aliases import Context
 # Quantiles of what unrewarded and rewarded steps return beside what the model says is task-free; rewards are told from the
 # model's errors by the middle between the two
 UNREWARDED, REWARDED = 0.999, 0.001
+# Networks see the tasks of a bank as so many, or twice as many, and so on: of each new shape, oneDNN keeps something for good
+BLOCK = 64
 
 
 class Particles(NamedTuple):
@@ -79,7 +81,7 @@ class LatentKnowledge(nn.Module):
         """
         self.set_aggregate(means)
         # A loaded model's particles are kept until this training knows as many
-        if int((bank.length > 0).sum()) >= max(int(self.n_particles), 1):
+        if bank.n_solved >= max(int(self.n_particles), 1):
             with th.no_grad():
                 self.set_particles(self._solved(policy, bank, gamma))
 
@@ -106,7 +108,7 @@ class LatentKnowledge(nn.Module):
 
     def _solved(self, policy: ContextualPolicy, bank: TaskBank, gamma: float) -> Particles:
         """A particle for each solved task; sets beside them what tells rewards from what is task-free."""
-        solved, columns, model = bank.solved(), bank.transitions, policy.reward_model
+        solved, columns, model = bank.solved(multiple=BLOCK), bank.transitions, policy.reward_model
         data = th.as_tensor(solved.rows, device=policy.device)
         lengths = th.as_tensor(solved.lengths, device=policy.device)
         action, reward = data[:, columns.action], data[:, columns.reward]
@@ -116,16 +118,16 @@ class LatentKnowledge(nn.Module):
         obs, next_obs = (policy.normalize(data[:, column]) for column in (columns.observation, columns.next_observation))
         # Of the steps that are rewarded: chance of a reward, and reward to be expected, under each task
         success = th.as_tensor(solved.success, device=policy.device)
-        episode = th.repeat_interleave(th.arange(len(z), device=z.device), lengths)[success]
-        states, tasks = model.state_tower(next_obs[success]), model.task_tower(z)
-        chance = model.success_logits(states, tasks).sigmoid()
+        episode = th.repeat_interleave(th.arange(len(z), device=z.device), lengths)
+        states, tasks = model.state_tower(next_obs), model.task_tower(z)
+        chance = model.success_logits(states, tasks).sigmoid() * success[:, None]
         expected = chance * model.success_rewards(states, tasks).clamp(min=0)
-        n_rewarded = th.zeros_like(z[:, 0]).index_add(0, episode, th.ones_like(episode, dtype=z.dtype)).clamp(min=1)[:, None]
+        n_rewarded = th.zeros_like(z[:, 0]).index_add(0, episode, success.to(z.dtype)).clamp(min=1)[:, None]
+        n = bank.n_solved
         overlap, earned = (th.zeros(len(z), len(z), device=z.device).index_add(0, episode, x) for x in (chance, expected))
-        overlap = overlap / n_rewarded
+        z, n_rewarded, overlap, earned = z[:n], n_rewarded[:n], overlap[:n, :n] / n_rewarded[:n], earned[:n, :n]
         share = (earned / earned.diag().clamp(min=1e-6)[:, None]).clamp(0, 1.2).fill_diagonal_(1)
-        is_train = th.as_tensor(solved.is_train, device=z.device)
-        returns = th.as_tensor(solved.returns, device=z.device)
+        is_train, returns = (th.as_tensor(x[:n], device=z.device) for x in (solved.is_train, solved.returns))
         task_free = model.task_free(obs, action, next_obs)
         self.task_free_value.copy_(task_free.mean() / max(1 - gamma, 1e-3))
         beside = reward - task_free

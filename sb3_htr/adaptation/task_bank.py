@@ -65,9 +65,15 @@ class TaskBank:
         self.best_return = np.zeros(self.n_train, dtype=np.float32)
         self.length = np.zeros(self.n_train, dtype=np.int64)
         self.episodes = np.zeros((self.n_train, context_size, transitions.width), dtype=np.float32)
-        self._rng = np.random.default_rng(seed)
+        self.seed(seed)
         #: Training tasks and transitions of the episodes since the last :meth:`update`
         self.new: list[tuple[int, np.ndarray]] = []
+
+    def seed(self, seed: int | None) -> None:
+        """
+        :param seed: of the choice of candidates
+        """
+        self._rng = np.random.default_rng(seed)
 
     def on_episode(self, task: int, episode: np.ndarray) -> None:
         """
@@ -145,15 +151,22 @@ class TaskBank:
         set_generator_state(self._rng, state["random"])
 
     @property
+    def n_solved(self) -> int:
+        """Number of tasks that some episode would have solved."""
+        return int((self.length > 0).sum())
+
+    @property
     def n_train_solved(self) -> int:
         """Number of training tasks that some episode would have solved."""
         return int((self.length[: self.n_train] > 0).sum())
 
-    def solved(self) -> SolvedTasks:
+    def solved(self, multiple: int = 1) -> SolvedTasks:
         """
+        :param multiple: of which the number of tasks shall be one; the first ones are repeated
         :return: the tasks that some episode would have solved
         """
         chosen = np.flatnonzero(self.length)
+        chosen = np.resize(chosen, len(chosen) + -len(chosen) % multiple)
         lengths = self.length[chosen]
         rows = self.episodes[chosen][np.arange(self.context_size) < lengths[:, None]]
         tasks = np.repeat(self.tasks[chosen], lengths, axis=0)

@@ -31,7 +31,7 @@ def check_is_no_gymnasium_vector_env(env: Any) -> None:
     if isinstance(env, gym.vector.VectorEnv):
         raise ValueError(
             "The env is a gymnasium VectorEnv, expected one of Stable-Baselines3: pass the env's id, or make it with "
-            "sb3_htr.common.vec_env.make_task_vec_env(id, n_envs)."
+            "sb3_htr.make_task_vec_env(id, n_envs)."
         )
 
 

@@ -1,6 +1,5 @@
 """The pictures of experiments, from the raw results of their cells."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -8,10 +7,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from htr_envs import PointRobotFamily
-from sb3_htr.experiments.runner import Cell
+from sb3_htr.experiments.calibration import expected_calibration_error
+from sb3_htr.experiments.cell import Cell
+from sb3_htr.experiments.protocol import scores
 from sb3_htr.zoo.plots.curves import band, finish
 from sb3_htr.zoo.plots.intervals import iqm_interval
-from sb3_htr.zoo.plots.style import COLOURS
+from sb3_htr.zoo.plots.style import COLOURS, curve_styles, save
 
 Results = dict[Cell, Path]
 
@@ -43,12 +44,15 @@ def learning(results: Results, path: Path) -> None:
     :param path: picture to write
     """
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
-    for colour, (variant, runs) in zip(COLOURS, by_variant(results).items(), strict=False):
+    groups = by_variant(results)
+    for (colour, _), (variant, runs) in zip(curve_styles([*groups]), groups.items(), strict=True):
         curve = np.stack([raw["curve"].mean(axis=1) for _, raw in runs])
         band(left, runs[0][1]["timesteps"] / 1000, curve, colour, "-", variant)
-        for explorer, style in zip(runs[0][0].explorers, ("-", "--"), strict=False):
-            returns = np.stack([raw[f"returns_{explorer}"].mean(axis=0) for _, raw in runs])
-            band(right, np.arange(1, returns.shape[1] + 1), returns, colour, style, f"{variant}, explorer {explorer}")
+        for explorer, style in zip(("belief", "prior"), ("-", "--"), strict=True):
+            if f"returns_{explorer}" not in runs[0][1]:
+                continue
+            returns = np.stack([raw[f"returns_{explorer}"] for _, raw in runs])
+            band(right, np.arange(1, returns.shape[-1] + 1), returns, colour, style, f"{variant}, explorer {explorer}")
     left.set_xlabel("thousand env steps of meta-training")
     left.set_ylabel("return of the last adaptation episode")
     left.set_title("validation tasks, during meta-training", fontsize=10)
@@ -83,20 +87,18 @@ def goal_distance(results: Results, path: Path) -> None:
     :param path: picture to write
     """
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
-    for colour, (variant, runs) in zip(COLOURS, by_variant(results).items(), strict=False):
+    groups = by_variant(results)
+    for (colour, _), (variant, runs) in zip(curve_styles([*groups]), groups.items(), strict=True):
         x = sorted({cell.env_kwargs["goal_distance"] for cell, _ in runs})
 
-        def scores(score: Callable[[Cell, Any], float], runs: list[tuple[Cell, Any]] = runs) -> np.ndarray:
-            """(n_seeds, n_distances)"""
-            ordered = sorted(runs, key=lambda run: (run[0].seed, run[0].env_kwargs["goal_distance"]))
-            return np.array([score(*run) for run in ordered]).reshape(n_seeds(results), -1)
-
-        def relative_return(cell: Cell, raw: Any) -> float:
-            return float(raw["returns_belief"][:, -1].mean() / optimal_return(**cell.env_kwargs))
-
-        band(left, np.array(x), scores(relative_return), colour, "-", variant)
-        success = scores(lambda cell, raw: float(raw["successes_belief"][:, -1].mean()))
-        band(right, np.array(x), success, colour, "-", variant)
+        ordered = sorted(runs, key=lambda run: (run[0].env_kwargs["goal_distance"], run[0].seed))
+        optimum = [optimal_return(**cell.env_kwargs) for cell, _ in ordered]
+        for axes, metric in ((left, "last_episode_return"), (right, "success_rate")):
+            values = scores([raw for _, raw in ordered], metric, "belief")
+            if axes is left:
+                values = values / np.array(optimum)[:, None, None]
+            # (n_seeds, n_eval_seeds, n_tasks, n_distances)
+            band(axes, np.array(x), np.stack(np.split(values, len(x)), axis=-1), colour, "-", variant)
     left.axhline(1, color=COLOURS[6], linestyle=":", linewidth=1)
     left.set_ylabel("return of the 20th episode / optimum")
     right.set_ylabel("test tasks solved in the 20th episode")
@@ -116,20 +118,70 @@ def relabelling(results: Results, path: Path) -> None:
     groups = {variant: [raw for _, raw in runs] for variant, runs in by_variant(results).items()}
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
     probabilities = sorted(float(variant.removeprefix("K = ")) for variant in groups if variant.startswith("K = "))
-    scores = [np.array([run["returns_belief"][:, -1].mean() for run in groups[f"K = {k:g}"]]) for k in probabilities]
-    points = np.array([iqm_interval(score) for score in scores])
+    returns = [scores(groups[f"K = {k:g}"], "last_episode_return", "belief") for k in probabilities]
+    points = np.array([iqm_interval(values) for values in returns])
     left.plot(probabilities, points[:, 0], "o-", color=COLOURS[0], label="IQM and 95 % interval")
     left.fill_between(probabilities, points[:, 1], points[:, 2], color=COLOURS[0], alpha=0.2, linewidth=0)
-    for k, score in zip(probabilities, scores, strict=True):
-        left.plot([k] * len(score), score, "o", color=COLOURS[6], markersize=3, label="one seed" if k == 0 else None)
+    for k, values in zip(probabilities, returns, strict=True):
+        label = "one seed" if k == 0 else None
+        left.plot([k] * len(values), values.mean(axis=(1, 2)), "o", color=COLOURS[6], markersize=3, label=label)
     left.set_xlabel("K, probability of relabelling")
     left.set_ylabel("return of the 20th adaptation episode")
     left.set_title("test tasks, final models", fontsize=10)
     shown = [variant for variant in groups if variant == "K = 0.8" or not variant.startswith("K = ")]
-    for colour, variant in zip(COLOURS, shown, strict=False):
+    for (colour, _), variant in zip(curve_styles(shown), shown, strict=True):
         curve = np.stack([run["curve"].mean(axis=1) for run in groups[variant]])
         band(right, groups[variant][0]["timesteps"] / 1000, curve, colour, "-", variant)
     right.set_xlabel("thousand env steps of meta-training")
     right.set_ylabel("return of the last adaptation episode")
     right.set_title("validation tasks, hindsight task strategies and ablation", fontsize=10)
     finish(figure, path, f"{next(iter(results)).env_id}: IQM over {n_seeds(results)} seeds, 95 % interval")
+
+
+def evaluations(results: Results, path: Path) -> None:
+    """
+    Return of the last adaptation episode by each explorer, in each env that the models were evaluated in.
+
+    :param results: raw results of the cells of one variant
+    :param path: picture to write
+    """
+    ((_, runs),) = by_variant(results).items()
+    cell, raws = runs[0][0], [raw for _, raw in runs]
+    explorers = list(dict.fromkeys(evaluation.explorer for evaluation in cell.evaluations))
+    places = [evaluation.tested_on for evaluation in cell.evaluations if evaluation.explorer == explorers[0]]
+    size = (3 + 2 * len(places), 3.6)
+    figure, grid = plt.subplots(1, len(places), figsize=size, layout="constrained", sharey=True, squeeze=False)
+    for axes, tested_on in zip(grid.flat, places, strict=True):
+        for evaluation in [evaluation for evaluation in cell.evaluations if evaluation.tested_on == tested_on]:
+            row = explorers.index(evaluation.explorer)
+            estimate, low, high = iqm_interval(scores(raws, "last_episode_return", evaluation.name))
+            axes.plot([low, high], [row, row], color=COLOURS[0], linewidth=3, alpha=0.4)
+            axes.plot(estimate, row, "o", color=COLOURS[0])
+        axes.set_title(", ".join(f"{key} {value}" for key, value in tested_on.items()) or "as in training", fontsize=10)
+        axes.set_xlim(left=-0.5)
+        axes.grid(alpha=0.25)
+    grid[0, 0].set_yticks(range(len(explorers)), explorers)
+    grid[0, 0].invert_yaxis()
+    figure.supxlabel("return of the last adaptation episode", fontsize=10)
+    figure.suptitle(f"{cell.env_id}: IQM over {n_seeds(results)} seeds, 95 % interval", fontsize=11)
+    save(figure, path)
+
+
+def reliability(results: Results, path: Path) -> None:
+    """
+    Frequency of success against its probability by the reward model, on validation tasks.
+
+    :param results: raw results of the cells
+    :param path: picture to write
+    """
+    figure, axes = plt.subplots(figsize=(4.8, 4.4), layout="constrained")
+    axes.plot([0, 1], [0, 1], color=COLOURS[6], linewidth=1)
+    groups = by_variant(results)
+    for (colour, _), (variant, runs) in zip(curve_styles([*groups]), groups.items(), strict=True):
+        bins = np.sum([raw["calibration"] for _, raw in runs], axis=0)
+        n, probability, successes = bins[bins[:, 0] > 0].T
+        label = f"{variant}: expected calibration error {expected_calibration_error(bins):.3f}"
+        axes.plot(probability / n, successes / n, "o-", color=colour, markersize=4, label=label)
+    axes.set_xlabel("probability of success by the reward model")
+    axes.set_ylabel("frequency of success")
+    finish(figure, path, f"{next(iter(results)).env_id}: states and validation tasks of {n_seeds(results)} seeds")

@@ -6,7 +6,20 @@ from pathlib import Path
 from typing import Any
 
 from sb3_htr.experiments import figures
-from sb3_htr.experiments.runner import Cell
+from sb3_htr.experiments.ablations import ABLATIONS
+from sb3_htr.experiments.cell import Cell, Evaluation, KwArgs
+
+EXPLORERS = ("belief", "learned-prior", "aggregate", "prior")
+BELIEF = ("belief",)
+
+
+def by(explorers: tuple[str, ...], *places: KwArgs) -> tuple[Evaluation, ...]:
+    """
+    :param explorers: names
+    :param places: arguments of the env that are other than in training; none are by default
+    :return: evaluations by each explorer in each of these envs
+    """
+    return tuple(Evaluation(explorer, place) for place in places or ({},) for explorer in explorers)
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,31 +36,35 @@ class Variant:
 
     method: str
     name: str = ""
-    settings: dict[str, Any] = field(default_factory=dict)
-    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    settings: KwArgs = field(default_factory=dict)
+    env_kwargs: KwArgs = field(default_factory=dict)
     budget: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
     """
+    :param name: of commands and folders
     :param about: one sentence
     :param env_id: registered env
     :param n_timesteps: env steps of a run
     :param variants: what is compared; the first is what the others are compared with
     :param seeds: runs of each variant
     :param eval_freq: env steps between evaluations on the validation tasks
-    :param explorers: how the final models explore on the test tasks
+    :param evaluations: what is done with the final models
+    :param models_of: name of the experiment whose runs are tested; by default it trains its own
     :param figure: draws the results of all cells into a file
     """
 
+    name: str
     about: str
     env_id: str
     n_timesteps: int
     variants: tuple[Variant, ...]
     seeds: int = 5
     eval_freq: int = 10_000
-    explorers: tuple[str, ...] = ("belief", "prior")
+    evaluations: tuple[Evaluation, ...] = by(EXPLORERS)
+    models_of: str = ""
     figure: Callable[[dict[Cell, Path], Path], None] = figures.learning
 
     def cells(self, seeds: int | None = None, scale: float = 1.0) -> list[Cell]:
@@ -58,6 +75,8 @@ class Experiment:
         """
         return [
             Cell(
+                experiment=self.name,
+                models_of=self.models_of or self.name,
                 env_id=self.env_id,
                 method=variant.method,
                 variant=variant.name or variant.method,
@@ -66,7 +85,7 @@ class Experiment:
                 eval_freq=max(int(self.eval_freq * scale), 1),
                 settings=variant.settings,
                 env_kwargs=variant.env_kwargs,
-                explorers=self.explorers,
+                evaluations=self.evaluations,
             )
             for seed in range(1, (seeds or self.seeds) + 1)
             for variant in self.variants
@@ -74,6 +93,12 @@ class Experiment:
 
 
 POINT, SPEED, WHEELED, ANT = "SparsePointRobot-v0", "SparseTargetSpeed-v0", "SparseWheeled-v0", "SparseAnt-v0"
+
+
+# The Point Robot's goals: as in training, nearer, and further away
+DISTANCES: tuple[KwArgs, ...] = ({}, {"goal_distance": 0.8}, {"goal_distance": 1.2}, {"goal_distance": 1.4})
+# Those of the robots that take long to simulate, further away
+FURTHER = by(("belief", "aggregate"), {"goal_distance": 2.5})
 
 
 def replay(**settings: Any) -> dict[str, Any]:
@@ -84,28 +109,53 @@ def replay(**settings: Any) -> dict[str, Any]:
     return {"replay_buffer_kwargs": settings}
 
 
-EXPERIMENTS: dict[str, Experiment] = {
-    "point_robot": Experiment(
+ALL = (
+    Experiment(
+        "point_robot",
         "HTR by both kinds of relabelling, against PEARL as published and with a dense proxy reward.",
         POINT,
         150_000,
         tuple(map(Variant, ("htr-ser", "htr-ec", "pearl-dense", "pearl-sparse", "pearl-sparse-prior"))),
+        evaluations=by(EXPLORERS, *DISTANCES),
     ),
-    "wheeled": Experiment(
+    # What cannot be interpolated: training tasks avoid 40 degrees of the semicircle, in which all test tasks lie
+    Experiment(
+        "held_out_sector",
+        "Goals in a sector that training tasks avoid.",
+        POINT,
+        150_000,
+        tuple(Variant(method, env_kwargs={"held_out": [70.0, 110.0]}) for method in ("htr-ser", "pearl-dense")),
+    ),
+    Experiment(
+        "ablation",
+        "The default explorer without one of its parts, with the same models.",
+        POINT,
+        150_000,
+        (Variant("htr-ser"),),
+        evaluations=by((*BELIEF, *ABLATIONS, *EXPLORERS[1:]), *DISTANCES),
+        models_of="point_robot",
+        figure=figures.evaluations,
+    ),
+    Experiment(
+        "wheeled",
         "HTR on a robot with wheels, against PEARL with a dense proxy reward and with the sparse one.",
         WHEELED,
         600_000,
         tuple(map(Variant, ("htr-ser", "pearl-dense", "pearl-sparse"))),
         eval_freq=50_000,
+        evaluations=(*by(EXPLORERS), *FURTHER),
     ),
-    "ant": Experiment(
+    Experiment(
+        "ant",
         "HTR on a robot with legs, against PEARL with a dense proxy reward and with the sparse one.",
         ANT,
         600_000,
         tuple(map(Variant, ("htr-ser", "pearl-dense", "pearl-sparse"))),
         eval_freq=100_000,
+        evaluations=(*by(EXPLORERS), *FURTHER),
     ),
-    "target_speed": Experiment(
+    Experiment(
+        "target_speed",
         "Tasks that are no places: both kinds of relabelling against PEARL with sparse and with dense rewards.",
         SPEED,
         60_000,
@@ -113,7 +163,8 @@ EXPERIMENTS: dict[str, Experiment] = {
     ),
     # HTR paper, figure 11. Steps of an episode for each distance: time to get there, and as long again. The budget is that of
     # episodes of 20 steps; longer ones have as many episodes and updates
-    "goal_distance": Experiment(
+    Experiment(
+        "goal_distance",
         "Goals ever further away.",
         POINT,
         60_000,
@@ -122,11 +173,12 @@ EXPERIMENTS: dict[str, Experiment] = {
             for distance, n_steps in ((0.5, 20), (0.75, 20), (1.0, 20), (1.5, 30), (2.0, 40))
             for method in ("htr-ser", "pearl-dense", "pearl-sparse")
         ),
-        explorers=("belief",),
+        evaluations=by(BELIEF),
         figure=figures.goal_distance,
     ),
     # The first one is what the others are compared with; then the paper's sweep of K, and no relabelling
-    "relabelling": Experiment(
+    Experiment(
+        "relabelling",
         "How often to relabel, which hindsight task to choose, and the ablation of HTR paper, B.2.",
         POINT,
         40_000,
@@ -137,14 +189,17 @@ EXPERIMENTS: dict[str, Experiment] = {
             Variant("htr-ser", "final state", replay(relabeller={"hindsight_task_strategy": "final"})),
             Variant("htr-ser", "RL batch of the task", replay(relabeller={"rl_batch_source": "task"})),
         ),
-        explorers=("belief",),
+        evaluations=by(BELIEF),
         figure=figures.relabelling,
     ),
-    "precision": Experiment(
+    Experiment(
+        "precision",
         "What matrix products of bfloat16 factors cost.",
         POINT,
         150_000,
         (Variant("htr-ser", "float32"), Variant("htr-ser", "bfloat16", {"matmul_precision": "medium"})),
-        explorers=("belief",),
+        evaluations=by(BELIEF),
     ),
-}
+)
+
+EXPERIMENTS: dict[str, Experiment] = {experiment.name: experiment for experiment in ALL}

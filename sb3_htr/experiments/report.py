@@ -2,7 +2,6 @@
 
 import json
 import platform
-from collections.abc import Callable
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -10,51 +9,30 @@ from typing import Any
 import numpy as np
 
 from sb3_htr.common.atomic import atomic_path
+from sb3_htr.experiments import figures
+from sb3_htr.experiments.calibration import expected_calibration_error
+from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.grid import Experiment
-from sb3_htr.experiments.runner import LOGGED, Cell, run_cells
+from sb3_htr.experiments.protocol import EVAL_SEEDS, METRICS, scores
+from sb3_htr.experiments.runner import LOGGED
 from sb3_htr.zoo.plots.intervals import iqm_difference, iqm_interval
 
 
-def loss_of_stability(curve: np.ndarray) -> float:
+def summarize(command: str, results: dict[Cell, Path]) -> dict[str, Any]:
     """
-    :param curve: (n_evaluations, n_tasks), returns on validation tasks during training
-    :return: how far the worst of the last three evaluations is below the best of all
-    """
-    means = curve.mean(axis=1)
-    return float(means.max() - means[-3:].min())
-
-
-def episodes_to_first_success(successes: np.ndarray) -> np.ndarray:
-    """
-    :param successes: (n_tasks, n_episodes)
-    :return: (n_tasks,), the first episode that solved the task; one more than there are if none did
-    """
-    return np.where(successes.any(axis=1), successes.argmax(axis=1) + 1, successes.shape[1] + 1)
-
-
-METRICS: dict[str, Callable[[Any, str], float]] = {
-    "last_episode_return": lambda raw, explorer: float(raw[f"returns_{explorer}"][:, -1].mean()),
-    "success_rate": lambda raw, explorer: float(raw[f"successes_{explorer}"][:, -1].mean()),
-    "episodes_to_first_success": lambda raw, explorer: float(episodes_to_first_success(raw[f"successes_{explorer}"]).mean()),
-    "loss_of_stability": lambda raw, explorer: loss_of_stability(raw["curve"]),
-}
-
-
-def summarize(name: str, command: str, results: dict[Cell, Path]) -> dict[str, Any]:
-    """
-    :param name: of the experiment
     :param command: that repeats it
-    :param results: raw results of its cells
+    :param results: raw results of the cells of an experiment
     :return: content of ``summary.json``
     """
     groups: dict[str, dict[str, list[Cell]]] = {}
     for cell in results:
         groups.setdefault(str(cell.env_kwargs), {}).setdefault(cell.variant, []).append(cell)
-    rows, differences = [], []
+    rows, differences, explorer_differences = [], [], []
     for variants in groups.values():
-        reference: np.ndarray | None = None
+        references: dict[str, np.ndarray] = {}
+        compared = next(iter(variants))
         for variant, cells in variants.items():
-            first, raw = cells[0], [np.load(results[cell]) for cell in cells]
+            first, raws = cells[0], [np.load(results[cell]) for cell in cells]
             about: dict[str, Any] = {
                 "env": first.env_id,
                 "env_kwargs": first.env_kwargs,
@@ -62,28 +40,37 @@ def summarize(name: str, command: str, results: dict[Cell, Path]) -> dict[str, A
                 "variant": variant,
             }
             about |= {"settings": first.settings, "env_steps": first.n_timesteps, "n_seeds": len(cells)}
-            means = {key: round(float(np.mean([r[key] for r in raw])), 4) for key in (*LOGGED, "wall_s")}
-            for explorer in first.explorers:
-                for metric, function in METRICS.items():
-                    scores = np.array([function(r, explorer) for r in raw])
-                    interval = _rounded(iqm_interval(scores))
-                    rows.append({**about, "explorer": explorer, "metric": metric, **interval, **means})
-            scores = np.array([METRICS["last_episode_return"](r, first.explorers[0]) for r in raw])
-            if reference is None:
-                reference, compared = scores, variant
-            else:
-                difference = {"of": compared, "metric": "last_episode_return", "explorer": first.explorers[0]}
-                differences.append({**about, **difference, **_rounded(iqm_difference(reference, scores))})
+            means = {key: round(float(np.mean([raw[key] for raw in raws])), 4) for key in (*LOGGED, "wall_s")}
+            calibration_error = expected_calibration_error(np.sum([raw["calibration"] for raw in raws], axis=0))
+            means["calibration_error"] = round(calibration_error, 4)
+            first_explorers: dict[str, tuple[str, np.ndarray]] = {}
+            for evaluation in first.evaluations:
+                tested = {**about, **evaluation._asdict()}
+                for metric in METRICS:
+                    interval = _rounded(iqm_interval(scores(raws, metric, evaluation.name)))
+                    rows.append({**tested, "metric": metric, **interval, **means})
+                returns = scores(raws, "last_episode_return", evaluation.name)
+                reference = references.setdefault(evaluation.name, returns)
+                explorer, by_it = first_explorers.setdefault(str(evaluation.tested_on), (evaluation.explorer, returns))
+                if explorer != evaluation.explorer:
+                    difference = {**tested, "of": explorer, "metric": "last_episode_return"}
+                    explorer_differences.append({**difference, **_rounded(iqm_interval(by_it - returns))})
+                if variant != compared:
+                    difference = {**tested, "of": compared, "metric": "last_episode_return"}
+                    differences.append({**difference, **_rounded(iqm_difference(reference, returns))})
     commits = sorted({str(np.load(path)["commit"]) for path in results.values()})
     return {
-        "name": name,
+        "name": next(iter(results)).experiment,
         "command": command,
         "commit": ", ".join(commits),
         "date": date.today().isoformat(),
         "machine": f"{_processor()}, one thread per run, Python {platform.python_version()}",
+        "n_eval_seeds": len(EVAL_SEEDS),
         "rows": rows,
-        # first variant minus this one
+        # first variant minus this one, by the same explorer on the same tasks
         "differences": differences,
+        # first explorer minus this one, of the same models
+        "explorer_differences": explorer_differences,
     }
 
 
@@ -99,11 +86,10 @@ def _processor() -> str:
     return platform.processor() or platform.machine()
 
 
-def write(name: str, command: str, experiment: Experiment, results: dict[Cell, Path], folder: Path) -> None:
+def write(command: str, experiment: Experiment, results: dict[Cell, Path], folder: Path) -> None:
     """
-    Write ``summary.json``, ``raw.npz`` and the picture of an experiment.
+    Write ``summary.json``, ``raw.npz`` and the pictures of an experiment.
 
-    :param name: of the experiment
     :param command: that repeats it
     :param experiment: draws the picture
     :param results: raw results of its cells
@@ -114,18 +100,6 @@ def write(name: str, command: str, experiment: Experiment, results: dict[Cell, P
     with atomic_path(folder / "raw.npz") as path:
         np.savez_compressed(path, **raw)
     with atomic_path(folder / "summary.json") as path:
-        path.write_text(json.dumps(summarize(name, command, results), indent=1) + "\n")
-    experiment.figure(results, folder / f"{name}.png")
-
-
-def run(name: str, command: str, experiment: Experiment, cells: list[Cell], runs: Path, output: Path, jobs: int) -> None:
-    """
-    :param name: of the experiment
-    :param command: that repeats it
-    :param experiment: what is run
-    :param cells: its runs
-    :param runs: folder for them
-    :param output: folder for the results
-    :param jobs: runs at a time
-    """
-    write(name, command, experiment, run_cells(cells, runs, jobs), output)
+        path.write_text(json.dumps(summarize(command, results), indent=1) + "\n")
+    experiment.figure(results, folder / f"{experiment.name}.png")
+    figures.reliability(results, folder / "reliability.png")

@@ -1,135 +1,129 @@
-"""Runs the cells of an experiment, several at a time, and picks up where a killed one stopped."""
+"""One cell, in whatever process an executor calls it: claimed, trained from where it was, and evaluated."""
 
-import json
-import os
-import subprocess
-import sys
-import time
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock, Timeout
 
 import htr_envs  # noqa: F401 registers the envs
-from sb3_htr.adaptation.evaluation import evaluate_adaptation
+from sb3_htr import PEARL
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.resume import checkpoints
-from sb3_htr.zoo.run.agents import RECORD, agent_at, find_run, read_record
+from sb3_htr.experiments.cell import Cell
+from sb3_htr.experiments.protocol import evaluate
+from sb3_htr.zoo.commands import train
+from sb3_htr.zoo.run.agents import RECORD, agent_at, file_stem, find_runs, read_record
 
 # Means over the training of what HTR paper, B.2 reasons with
 LOGGED = ("relabelled_fraction", "rl_reward_mean", "rl_zero_reward_fraction")
 
 
-@dataclass(frozen=True, eq=False)
-class Cell:
+def claim(cell: Cell, runs: Path) -> FileLock:
     """
-    One training run.
-
-    :param env_id: registered env
-    :param method: name in hyperparams/methods.yml
-    :param variant: name in tables and folders
-    :param seed: seed of the run
-    :param n_timesteps: budget of env steps
-    :param eval_freq: env steps between evaluations on the validation tasks
-    :param settings: hyperparameters, joined with those of env and method
-    :param env_kwargs: arguments of the env
-    :param explorers: how the final model explores on the test tasks; one row of results for each
+    :param cell: of an experiment
+    :param runs: folder of all experiments' runs
+    :return: what a process has as long as it runs the cell; the system takes it back when the process ends, however it does
     """
-
-    env_id: str
-    method: str
-    variant: str
-    seed: int
-    n_timesteps: int
-    eval_freq: int
-    settings: dict[str, Any]
-    env_kwargs: dict[str, Any]
-    explorers: tuple[str, ...]
-
-    @property
-    def name(self) -> str:
-        """Folder of the run."""
-        kwargs = "".join(f"-{key}{value}" for key, value in self.env_kwargs.items())
-        return f"{self.variant}{kwargs}-seed{self.seed}".replace(" ", "")
-
-    def command(self, folder: Path) -> list[str]:
-        """
-        :param folder: log folder
-        :return: command line of the training
-        """
-        settings = [f"{key}:{value!r}" for key, value in self.settings.items()]
-        kwargs = [f"{key}:{value!r}" for key, value in self.env_kwargs.items()]
-        return [
-            *(sys.executable, "-m", "sb3_htr.zoo.cli", "train", "--env", self.env_id, "--method", self.method),
-            *("-f", str(folder), "--verbose", "0", "-n", str(self.n_timesteps)),
-            *("--seed", str(self.seed), "--eval-freq", str(self.eval_freq)),
-            *(["-params", *settings] if settings else []),
-            *(["--env-kwargs", *kwargs] if kwargs else []),
-        ]
+    return FileLock(cell.run_folder(runs) / ".claim")
 
 
-def run_cell(cell: Cell, folder: Path) -> Path:
+def run_cell(cell: Cell, runs: Path) -> bool:
     """
-    Train, then adapt the final model to the test tasks.
+    Train, unless there is a finished run, then evaluate the final model.
+
+    The result is an npz with ``timesteps``, ``curve`` (n, n_tasks) on validation tasks; what
+    :func:`sb3_htr.experiments.protocol.evaluate` tells of the final model; the means of what is in ``LOGGED``; ``wall_s`` of
+    the training and ``commit`` of the code that trained. What would be printed is in the ``log.txt`` of its folder.
 
     :param cell: what to run
-    :param folder: where all cells' folders are; a cell that has a result there is not run again
-    :return: npz with ``timesteps``, ``curve`` (n, n_tasks) on validation tasks, and for each explorer
-        ``returns_<explorer>`` and ``successes_<explorer>`` (n_tasks, n_episodes) on test tasks; the means of what is in
-        ``LOGGED``; ``wall_s`` of the training and ``commit`` of the code
+    :param runs: folder of all experiments' runs; a cell that has a result there is not run again
+    :return: whether there is a result; if not, another process runs the cell
+    :raises FileNotFoundError: if there is no such folder
+    :raises ValueError: if the run in the cell's folder is another one
+    :raises KeyboardInterrupt: if the training was stopped before its end, with a checkpoint
     """
-    result = folder / f"{cell.name}.npz"
-    if result.exists():
-        return result
-    start = time.monotonic()
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    (folder / cell.name).mkdir(parents=True, exist_ok=True)
-    command = _resume(folder / cell.name) or cell.command(folder / cell.name)
-    with open(folder / cell.name / "log.txt", "a") as log:
-        subprocess.run(command, check=True, stdout=log, stderr=log, env=environment)
-    wall = time.monotonic() - start
-    run = find_run(folder / cell.name)
-    agent = agent_at(run, "last")
-    model, env = agent.load(), agent.make_vec_env(20)
+    if not runs.is_dir():
+        raise FileNotFoundError(f"There is no folder {runs} on this node: give --runs that all nodes see.")
+    result, folder = cell.result(runs), cell.run_folder(runs)
+    for path in (folder, result.parent):
+        path.mkdir(parents=True, exist_ok=True)
+    try:
+        with claim(cell, runs).acquire(timeout=0):
+            if not result.exists():
+                with _logged(folder / "log.txt"):
+                    arrays = _train_and_evaluate(cell, folder)
+                with atomic_path(result) as path:
+                    np.savez_compressed(path, **arrays)
+            return True
+    except Timeout:
+        return False
+
+
+def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
+    trained = find_finished(cell, folder)
+    if trained is None:
+        unfinished = [run for run in folder.glob("*/*") if checkpoints(run)]
+        train.main(["--resume", str(unfinished[-1])] if unfinished else cell.training(folder))
+        trained = find_finished(cell, folder)
+        if trained is None:
+            raise KeyboardInterrupt
+    run, model = trained
     evaluations = np.load(run / "evaluations.npz")
     progress = np.genfromtxt(run / "progress.csv", delimiter=",", names=True, deletechars="")
-    arrays: dict[str, Any] = {
+    return {
         **{key: np.nanmean(progress[f"train/{key}"]) for key in LOGGED},
         "timesteps": evaluations["timesteps"],
         "curve": evaluations["results"],
-        "wall_s": wall,
+        "wall_s": _wall_time(progress["time/time_elapsed"]),
         "commit": _commit_of(run),
+        **evaluate(cell, model),
     }
-    for explorer in cell.explorers:
-        returns, successes = evaluate_adaptation(model, env, explorer=explorer)
-        arrays |= {f"returns_{explorer}": returns.astype(np.float32), f"successes_{explorer}": successes}
-    with atomic_path(result) as path:
-        np.savez_compressed(path, **arrays)
-    print(f"{cell.name}: {json.dumps({e: round(float(arrays[f'returns_{e}'][:, -1].mean()), 2) for e in cell.explorers})}")
-    return result
 
 
-def _resume(folder: Path) -> list[str] | None:
-    """Command that goes on with a run that was killed, None if there is none."""
-    unfinished = [run for run in folder.glob("*/*") if checkpoints(run)]
-    return [sys.executable, "-m", "sb3_htr.zoo.cli", "train", "--resume", str(unfinished[-1])] if unfinished else None
+def find_finished(cell: Cell, folder: Path) -> tuple[Path, PEARL] | None:
+    """
+    :param cell: what was to be trained
+    :param folder: log folder
+    :return: the run folder and its final model, None if there is no run, or none that is finished
+    :raises ValueError: if a run in the folder is another one
+    """
+    for run in find_runs(folder) if any(folder.rglob(RECORD)) else ():
+        record = read_record(run / RECORD)
+        for key in ("env_id", "env_kwargs", "method", "seed", "n_timesteps"):
+            if record[key] != getattr(cell, key):
+                raise ValueError(
+                    f"{run} has {key} {record[key]!r}, but {cell.experiment}/{cell.name} needs {getattr(cell, key)!r}: "
+                    f"move this run away, or choose other --runs."
+                )
+        # An interrupted training leaves a model, too
+        if (run / f"{file_stem(cell.env_id)}.zip").exists():
+            model = agent_at(run, "last").load()
+            if model.num_timesteps >= cell.n_timesteps:
+                return run, model
+    return None
+
+
+@contextmanager
+def _logged(file: Path) -> Iterator[None]:
+    with open(file, "a", buffering=1) as log, redirect_stdout(log), redirect_stderr(log):
+        try:
+            yield
+        except Exception:
+            traceback.print_exc()
+            raise
+
+
+def _wall_time(elapsed: np.ndarray) -> float:
+    """Seconds, from those since the training began or went on (n,)."""
+    elapsed = elapsed[~np.isnan(elapsed)]
+    return float(elapsed[np.append(np.diff(elapsed) < 0, True)].sum())
 
 
 def _commit_of(run: Path) -> str:
     """Of the code that trained, as it was when the training began."""
     record = read_record(run / RECORD)
     return f"{record.get('commit', 'unknown')}{'' if record.get('clean', True) else ' with changes'}"
-
-
-def run_cells(cells: list[Cell], folder: Path, jobs: int) -> dict[Cell, Path]:
-    """
-    :param cells: runs of the experiment
-    :param folder: where runs and results go
-    :param jobs: number of runs at a time, each on one thread
-    :return: the result file of each cell
-    """
-    with ThreadPoolExecutor(jobs) as pool:
-        paths = list(pool.map(lambda cell: run_cell(cell, folder), cells))
-    return dict(zip(cells, paths, strict=True))

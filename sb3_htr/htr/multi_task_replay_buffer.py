@@ -280,8 +280,9 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         """
         Draw a meta-batch: tasks with replacement (as PEARL's reference does), and for each of them context and RL batch.
 
-        No transition is drawn twice: where the episodes that a task's context or RL batch comes from hold fewer than asked
-        for, it is all of them. A loss that weighs tasks equally has the same expectation as with duplicates, for less work.
+        Where the episodes that a task's context or RL batch comes from hold fewer transitions than asked for, it is all of
+        them, and none is drawn twice (but for the share that a relabeller draws from anywhere). A loss that weighs tasks
+        equally has the same expectation as with duplicates, for less work.
 
         :param batch_size: transitions per task for actor and critics, at most
         :param meta_batch_size: number of tasks, M

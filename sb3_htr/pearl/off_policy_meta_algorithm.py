@@ -24,7 +24,6 @@ from stable_baselines3.sac import SAC
 
 from sb3_htr.adaptation.adaptation import Adaptation, Step
 from sb3_htr.adaptation.agent import AdaptedAgent
-from sb3_htr.adaptation.evaluation import run_adaptation
 from sb3_htr.adaptation.explorers import Explorer, to_explorer
 from sb3_htr.adaptation.knowledge import LatentKnowledge
 from sb3_htr.adaptation.loop import adaptation_steps
@@ -35,6 +34,7 @@ from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.random_state import get_generator_state, get_global_state, set_generator_state, set_global_state
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
+from sb3_htr.pearl.horizon import complete, timesteps_for
 from sb3_htr.pearl.policies import PEARLPolicy
 
 SelfMetaAlgorithm = TypeVar("SelfMetaAlgorithm", bound="OffPolicyMetaAlgorithm")
@@ -48,12 +48,15 @@ class OffPolicyMetaAlgorithm(SAC):
 
     :param policy: name or class of the policy
     :param env: env of a task family (see ``htr_envs.TaskEnv``), VecEnv of such envs, or registered id
-    :param context_size: transitions per task for the context, at most
     :param n_tasks_per_rollout: training tasks per rollout
     :param n_episodes_per_task: episodes on each of them
+    :param learning_starts: env steps with random actions before learning starts
+    :param gradient_steps: updates after each rollout
+    :param batch_size: transitions per task for actor and critics, at most
+    :param context_size: transitions per task for the context, at most
+    :param gamma: discount. Which of these six are None follow from the time limit: :func:`sb3_htr.pearl.horizon.settings_for`
     :param explorer: chooses z at meta-test: an explorer, its name, or its name and settings
     :param train_explorer: the same for rollouts
-    :param learning_starts: env steps with random actions before learning starts
     :param replay_buffer_class: a MultiTaskReplayBuffer
     :param replay_buffer_kwargs: its arguments
     :param policy_kwargs: arguments of the policy
@@ -69,25 +72,22 @@ class OffPolicyMetaAlgorithm(SAC):
         policy: str | type[PEARLPolicy],
         env: GymEnv | str | None,
         *,
-        context_size: int,
         n_tasks_per_rollout: int,
-        n_episodes_per_task: int,
+        n_episodes_per_task: int | None,
+        learning_starts: int | None,
+        gradient_steps: int | None,
+        batch_size: int | None,
+        context_size: int | None,
+        gamma: float | None,
         explorer: Explorer | dict[str, Any] | str,
         train_explorer: Explorer | dict[str, Any] | str,
-        learning_starts: int,
         replay_buffer_class: type[MultiTaskReplayBuffer] | None,
         replay_buffer_kwargs: dict[str, Any] | None,
         policy_kwargs: dict[str, Any] | None,
         seed: int | None,
         **kwargs: Any,
     ) -> None:
-        infinity = float("inf")
-        checks.check_numbers(
-            context_size=(context_size, 1, infinity),
-            n_tasks_per_rollout=(n_tasks_per_rollout, 1, infinity),
-            n_episodes_per_task=(n_episodes_per_task, 1, infinity),
-            learning_starts=(learning_starts, 0, infinity),
-        )
+        checks.check_numbers(n_tasks_per_rollout=(n_tasks_per_rollout, 1, float("inf")))
         self.explorer, self.train_explorer = to_explorer(explorer), to_explorer(train_explorer)
         buffer_class = replay_buffer_class or MultiTaskReplayBuffer
         checks.check_keywords("replay_buffer_kwargs", replay_buffer_kwargs or {}, buffer_class)
@@ -96,10 +96,24 @@ class OffPolicyMetaAlgorithm(SAC):
         if env is not None:
             env = self._wrap_env(env)
             checks.check_spaces(env)
+        given = {
+            "gamma": gamma,
+            "n_episodes_per_task": n_episodes_per_task,
+            "learning_starts": learning_starts,
+            "gradient_steps": gradient_steps,
+            "batch_size": batch_size,
+            "context_size": context_size,
+        }
+        # Without an env, which is for files alone, the settings come from there
+        max_episode_steps = 1 if env is None else checks.get_max_episode_steps(env)
+        settings = complete(given, max_episode_steps, n_tasks_per_rollout)
         super().__init__(
             policy=policy,
             env=env,  # type: ignore[arg-type]
-            learning_starts=learning_starts,
+            gamma=settings["gamma"],
+            learning_starts=settings["learning_starts"],
+            gradient_steps=settings["gradient_steps"],
+            batch_size=settings["batch_size"],
             replay_buffer_class=buffer_class,
             replay_buffer_kwargs=replay_buffer_kwargs,
             policy_kwargs={} if policy_kwargs is None else dict(policy_kwargs),
@@ -110,9 +124,9 @@ class OffPolicyMetaAlgorithm(SAC):
         # SAC adds an argument for state-dependent exploration, which is not for us: z explores
         self.policy_kwargs.pop("use_sde")
         checks.check_keywords("policy_kwargs", self.policy_kwargs, self.policy_class)
-        self.context_size = context_size
+        self.context_size = settings["context_size"]
         self.n_tasks_per_rollout = n_tasks_per_rollout
-        self.n_episodes_per_task = n_episodes_per_task
+        self.n_episodes_per_task = settings["n_episodes_per_task"]
         self.task_bank: TaskBank | None = None
         #: Called after each update
         self.update_listeners: list[Callable[[], None]] = []
@@ -180,18 +194,20 @@ class OffPolicyMetaAlgorithm(SAC):
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """
-        :param seed: seed of python, numpy, torch, envs, rollout tasks and replay buffer
+        :param seed: seed of python, numpy, torch, envs, rollout tasks, replay buffer and task bank
         """
         super().set_random_seed(seed)
         self._rng = np.random.default_rng(seed)
         if isinstance(self.replay_buffer, MultiTaskReplayBuffer) and seed is not None:
             self.replay_buffer.seed(seed)
+        if self.task_bank is not None and seed is not None:
+            self.task_bank.seed(seed)
 
     # Meta-training
 
     def learn(
         self: SelfMetaAlgorithm,
-        total_timesteps: int = 150_000,
+        total_timesteps: int | None = None,
         callback: MaybeCallback = None,
         log_interval: int | None = 1,
         tb_log_name: str = "PEARL",
@@ -201,7 +217,8 @@ class OffPolicyMetaAlgorithm(SAC):
         """
         Meta-train.
 
-        :param total_timesteps: env steps; the last rollout is finished
+        :param total_timesteps: env steps; the last rollout is finished. By default, what follows from the time limit, see
+            :func:`sb3_htr.pearl.horizon.timesteps_for`
         :param callback: called at every step
         :param log_interval: rollouts between two logs, None for no logs
         :param tb_log_name: name of the run for TensorBoard
@@ -209,6 +226,9 @@ class OffPolicyMetaAlgorithm(SAC):
         :param progress_bar: show one
         :return: self
         """
+        if total_timesteps is None:
+            assert self.replay_buffer is not None
+            total_timesteps = timesteps_for(self.replay_buffer.max_episode_steps)
         return super().learn(
             total_timesteps=total_timesteps,
             callback=callback,
@@ -373,18 +393,20 @@ class OffPolicyMetaAlgorithm(SAC):
         seed: int = 0,
     ) -> AdaptedAgent:
         """
-        Adapt to one task by trying it.
+        Adapt to one task by trying it, from observations, actions and rewards.
 
-        :param env: env with the task, or an id
+        :param env: env with the task, or an id. It need not be of the task family that the model knows, or of any: an env of
+            the same spaces, such as the real robot, is enough, if its episodes are all of one task
         :param n_episodes: episodes to adapt in. The agent then acts with the z of the best one, or with a draw from its
             posterior where none was tried yet (explorer ``"prior"``: with a draw from the posterior over all of them)
         :param task: index of a training task or task vector; by default the task that the env has (if it has none yet, one
-            is drawn). The env keeps it.
+            is drawn). The env keeps it. An env without task family takes none
         :param explorer: an explorer, its name, or its name and settings; the model's own by default
         :param deterministic: adapt with mean actions instead of samples
         :param seed: seed of z
-        :return: an agent for this task, with the returns of its adaptation episodes
-        :raises ValueError: for several envs, an env without tasks or with other spaces, a task that the env does not have
+        :return: an agent for this task, with the returns of its adaptation episodes, and whether each was a success: if the
+            env does not say so (``info["is_success"]``), whether a reward was told from what is task-free
+        :raises ValueError: for several envs, an env with other spaces, a task that the env does not have
         """
         if n_episodes < 1:
             raise ValueError(f"n_episodes is {n_episodes}, expected at least 1.")
@@ -392,20 +414,27 @@ class OffPolicyMetaAlgorithm(SAC):
         if vec_env.num_envs != 1:
             raise ValueError(f"adapt() adapts to one task, but the VecEnv has {vec_env.num_envs} envs: pass a single env.")
         checks.check_is_not_normalized(vec_env)
-        checks.get_task_family(vec_env)
         check_for_correct_spaces(vec_env, self.observation_space, self.action_space)
-        if task is None:
-            vec_env.reset()
-            task = np.array(vec_env.get_attr("task")[0])
-        vec_env.set_options({"task_id": int(task)} if np.ndim(task) == 0 else {"task": np.asarray(task, dtype=np.float32)})
+        if vec_env.has_attr("task_family"):
+            if task is None:
+                vec_env.reset()
+                task = np.array(vec_env.get_attr("task")[0])
+            vec_env.set_options({"task_id": int(task)} if np.ndim(task) == 0 else {"task": np.asarray(task, dtype=np.float32)})
+        elif task is not None:
+            raise ValueError("The env has no task family, so it takes no task: leave task out, and set its task yourself.")
         adaptation = self.start_adaptation(1, explorer, th.Generator().manual_seed(seed))
-        record = run_adaptation(self.policy, vec_env, adaptation, n_episodes, deterministic)
+        returns, successes = np.zeros(n_episodes), np.zeros(n_episodes, dtype=bool)
+        act = partial(adaptation.act, deterministic=deterministic)
+        for step in adaptation_steps(vec_env, adaptation, n_episodes, self.policy.unscale_action, act):
+            episode = adaptation.n_episodes[0] - step.dones[0]
+            returns[episode] += step.rewards[0]
+            successes[episode] |= step.infos[0].get("is_success", adaptation.task_reward[0] > 0)
         if adaptation.best_return[0] <= 0:
             warnings.warn(
                 f"No reward was found in {n_episodes} episodes, so the agent is not adapted: allow more, or train longer.",
                 stacklevel=2,
             )
-        return AdaptedAgent(self.policy, adaptation.explorer.final_z()[0], record.returns[0], record.successes[0])
+        return AdaptedAgent(self.policy, adaptation.explorer.final_z()[0], returns, successes)
 
     def predict(
         self,

@@ -32,18 +32,21 @@ class PEARL(OffPolicyMetaAlgorithm):
     critics instead of a value network.
 
     One rollout collects whole episodes on ``n_tasks_per_rollout`` training tasks, as many at once as there are envs; then
-    follow ``gradient_steps`` updates. The defaults are the fast profile for two CPU cores on SparsePointRobot-v0, found by
-    measurement; the paper's values (A.2) are in ``hyperparams/pearl_paper.yml`` and given here where they differ.
+    follow ``gradient_steps`` updates. The defaults are the fast profile for two CPU cores, found by measurement; six of them
+    follow from the time limit of the env (:func:`sb3_htr.pearl.horizon.settings_for`). The papers' values are in
+    ``hyperparams/pearl_paper.yml`` and given here where they differ.
 
     :param policy: ``"MlpPolicy"`` or a subclass of PEARLPolicy
     :param env: env of a task family (see ``htr_envs.TaskEnv``), VecEnv of such envs, or registered id
     :param learning_rate: of all networks, may be a function of the remaining progress (paper: 3e-4)
     :param buffer_size: capacity in transitions, shared equally by the training tasks
-    :param learning_starts: env steps with random actions before learning starts
-    :param batch_size: transitions per task for actor and critics, fewer where fewer are at hand (PEARL's reference: 256)
+    :param learning_starts: env steps with random actions before learning starts, one rollout by default
+    :param batch_size: transitions per task for actor and critics, fewer where fewer are at hand, an episode or 24 by default
+        (PEARL's reference: 256)
     :param tau: soft update of the target critics, in (0, 1] (PEARL's reference: 0.005)
-    :param gamma: discount (PEARL's reference for the sparse point robot: 0.9)
-    :param gradient_steps: updates after each rollout (PEARL's reference: 1000)
+    :param gamma: discount, 1 - 2 / T for T steps of an episode by default, 0.98 at most (PEARL's reference for the sparse
+        point robot: 0.9, which it is there)
+    :param gradient_steps: updates after each rollout, one for 20 env steps by default (PEARL's reference: 1000)
     :param replay_buffer_class: a MultiTaskReplayBuffer
     :param replay_buffer_kwargs: its arguments, among them ``relabel_probability`` (K of HTR; 0 is plain PEARL)
     :param ent_coef: entropy coefficient, ``"auto"`` learns it (0.01 is the reward scale 100 of PEARL's reference)
@@ -51,14 +54,14 @@ class PEARL(OffPolicyMetaAlgorithm):
     :param target_entropy: for ``ent_coef="auto"``
     :param meta_batch_size: tasks per update (paper: 16)
     :param context_size: transitions per task for the context, fewer where fewer are at hand: under relabelling, at most an
-        episode (PEARL's reference: 1024)
+        episode; an episode or 24 by default (PEARL's reference: 1024)
     :param kl_coef: weight of the KL divergence of the posterior from N(0, I), summed over z's dimensions and averaged over
         tasks, beside the critics' squared errors averaged over transitions (PEARL's reference, in these units: 0.0016)
     :param reward_coef: weight of the losses of the reward model, which shape z as well: z must tell tasks apart. By
         measurement, on a two-link arm (one seed), with losses in every update: .91 of the tasks are solved at 0, .99 and more
         at .5 and 2. They are in one of four updates, in which 8 counts as much as 2 in each
     :param n_tasks_per_rollout: training tasks per rollout (PEARL's reference: 10)
-    :param n_episodes_per_task: episodes on each of them
+    :param n_episodes_per_task: episodes on each of them, from 2 to 10 by default, of 400 steps in all
     :param explorer: chooses z at meta-test: an :class:`sb3_htr.adaptation.Explorer`, its name, or its name and settings,
         ``{"name": "prior", "n_exploration_episodes": 9}``
     :param train_explorer: the same for rollouts
@@ -86,22 +89,22 @@ class PEARL(OffPolicyMetaAlgorithm):
         env: GymEnv | str | None,
         learning_rate: float | Schedule = 1e-3,
         buffer_size: int = 1_000_000,
-        learning_starts: int = 4_000,
-        batch_size: int = 16,
+        learning_starts: int | None = None,
+        batch_size: int | None = None,
         tau: float = 0.01,
-        gamma: float = 0.9,
-        gradient_steps: int = 200,
+        gamma: float | None = None,
+        gradient_steps: int | None = None,
         replay_buffer_class: type[MultiTaskReplayBuffer] | None = None,
         replay_buffer_kwargs: dict[str, Any] | None = None,
         ent_coef: str | float = 0.01,
         target_update_interval: int = 1,
         target_entropy: str | float = "auto",
         meta_batch_size: int = 64,
-        context_size: int = 20,
+        context_size: int | None = None,
         kl_coef: float = 0.001,
         reward_coef: float = 8.0,
         n_tasks_per_rollout: int = 20,
-        n_episodes_per_task: int = 10,
+        n_episodes_per_task: int | None = None,
         explorer: Explorer | dict[str, Any] | str = "belief",
         train_explorer: Explorer | dict[str, Any] | str = "aggregate",
         matmul_precision: str = "highest",
@@ -116,12 +119,9 @@ class PEARL(OffPolicyMetaAlgorithm):
         infinity = float("inf")
         check_numbers(
             meta_batch_size=(meta_batch_size, 1, infinity),
-            batch_size=(batch_size, 1, infinity),
-            gradient_steps=(gradient_steps, 1, infinity),
             target_update_interval=(target_update_interval, 1, infinity),
             kl_coef=(kl_coef, 0.0, infinity),
             reward_coef=(reward_coef, 0.0, infinity),
-            gamma=(gamma, 0.0, 1.0),
             tau=(tau, 0.0, 1.0),
         )
         if tau == 0:

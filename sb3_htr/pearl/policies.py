@@ -74,7 +74,8 @@ class PEARLPolicy(SACPolicy):
     :param encoder_class: what infers z, see :class:`ContextEncoder`
     :param latent_dim: dimension of z (paper A.2: 5)
     :param normalize_observations: all networks see observations less their running mean in training, divided by the standard
-        deviation
+        deviation. By measurement (one seed each), the Wheeled robot learns in half the steps with it, and the Point Robot as
+        well as without it
     :param activation_fn: activation of all networks
     :param n_critics: number of critics
     :param optimizer_class: optimizer of all networks
@@ -90,7 +91,7 @@ class PEARLPolicy(SACPolicy):
         encoder_arch: list[int] | None = None,
         encoder_class: type[ContextEncoder] = ContextEncoder,
         latent_dim: int = 5,
-        normalize_observations: bool = False,
+        normalize_observations: bool = True,
         activation_fn: type[nn.Module] = nn.ReLU,
         n_critics: int = 2,
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,

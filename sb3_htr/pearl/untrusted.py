@@ -115,7 +115,7 @@ def _policy_kwargs(given: dict[str, Any]) -> dict[str, Any]:
     for units in (kwargs.get("net_arch", []), kwargs.get("encoder_arch", []), [kwargs.get("latent_dim", 1)]):
         if len(units) > MAX_LAYERS or not all(type(unit) is int and 1 <= unit <= MAX_UNITS for unit in units):
             raise ValueError(f"PEARL's networks do not have layers of {units} units.")
-    return {**kwargs, "normalize_observations": bool(kwargs.get("normalize_observations", False))}
+    return {**kwargs, "normalize_observations": bool(kwargs.get("normalize_observations", True))}
 
 
 def _check_shapes(path: str | os.PathLike[str], weights: dict[str, Any], env: GymEnv, policy_kwargs: dict[str, Any]) -> None:

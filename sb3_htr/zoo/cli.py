@@ -31,6 +31,7 @@ EXTRAS = {
     **dict.fromkeys(("rl_zoo3", "optuna", "sqlalchemy", "yaml", "huggingface_hub", "filelock"), "zoo"),
     **dict.fromkeys(("matplotlib", "rliable", "pandas", "scipy"), "plots"),
     "PIL": "video",
+    "pygame": "video",
     "imageio_ffmpeg": "video",
     "mujoco": "mujoco",
     "gymnasium_robotics": "robotics",
@@ -38,6 +39,7 @@ EXTRAS = {
     "metaworld": "metaworld",
     "tensorboard": "tensorboard",
     "psycopg": "postgresql",
+    "ray": "ray",
 }
 # What a user can put right, and has a sentence of its own: bad settings and files, missing packages, unknown envs, training
 # that diverges

@@ -119,6 +119,36 @@ def test_adapt_gives_an_agent_for_the_task_of_the_env(tiny_pearl: MakePEARL) -> 
     assert action.shape == (2,) and state is None
 
 
+class Plain(gym.Env[np.ndarray, np.ndarray]):
+    """The real robot: spaces, steps and a reward that depends on a goal which nothing tells; infos are empty."""
+
+    def __init__(self, goal: np.ndarray) -> None:
+        self._robot = gym.make(ENV_ID)
+        self._goal = {"task": goal}
+        self.observation_space, self.action_space = self._robot.observation_space, self._robot.action_space
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        assert not options, "it knows of no options"
+        return self._robot.reset(seed=seed, options=self._goal)[0], {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        obs, reward, terminated, truncated, _ = self._robot.step(action)
+        return obs, float(reward), terminated, truncated, {}
+
+
+@pytest.mark.parametrize("explorer", ["belief", "aggregate", "prior", "learned-prior"])
+def test_a_plain_env_without_task_family_and_infos_is_adapted_to_as_well(tiny_pearl: MakePEARL, explorer: str) -> None:
+    model = tiny_pearl(make_task_vec_env(ENV_ID, 4, env_kwargs={"goal_distance": 0.3})).learn(4 * ROLLOUT)
+    goal = np.array([0.05, 0.05], dtype=np.float32)
+    ours, theirs = model.adapt(Plain(goal), 4, explorer=explorer), model.adapt(ENV_ID, 4, goal, explorer=explorer)
+    np.testing.assert_array_equal(ours.z, theirs.z)
+    np.testing.assert_array_equal(ours.returns, theirs.returns)
+    assert ours.returns.max() > 0
+    np.testing.assert_array_equal(ours.successes, ours.returns > 0)
+    with pytest.raises(ValueError, match="no task family, so it takes no task"):
+        model.adapt(Plain(goal), task=3)
+
+
 def test_adapt_says_when_nothing_was_found(tiny_pearl: MakePEARL) -> None:
     with pytest.warns(UserWarning, match="No reward was found in 2 episodes"):
         agent = tiny_pearl().adapt(ENV_ID, n_episodes=2, task=np.array([9.0, 9.0]))

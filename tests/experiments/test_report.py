@@ -9,10 +9,10 @@ import pytest
 import tables
 
 from sb3_htr.experiments import figures, report
+from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.grid import EXPERIMENTS
-from sb3_htr.experiments.report import episodes_to_first_success, loss_of_stability
-from sb3_htr.experiments.runner import LOGGED, Cell
-from sb3_htr.zoo.plots.intervals import iqm_difference, iqm_interval
+from sb3_htr.experiments.protocol import EVAL_SEEDS, METRICS
+from sb3_htr.experiments.runner import LOGGED
 from sb3_htr.zoo.run.method import methods
 
 
@@ -26,9 +26,11 @@ def made_up(cells: list[Cell], folder: Path) -> dict[Cell, Path]:
             "wall_s": 1.0,
         }
         arrays |= {"commit": "abc", **{key: 0.5 for key in LOGGED}}
-        for explorer in cell.explorers:
-            arrays[f"returns_{explorer}"] = np.full((20, 6), float(cell.seed), dtype=np.float32)
-            arrays[f"successes_{explorer}"] = np.arange(6) >= np.full((20, 1), 2)
+        arrays["calibration"] = np.tile([[4.0, 1.0, 2.0]], (10, 1))
+        for evaluation in cell.evaluations:
+            returns = float(cell.seed + len(evaluation.tested_on))
+            arrays[f"returns_{evaluation.name}"] = np.full((len(EVAL_SEEDS), 20, 6), returns, dtype=np.float32)
+            arrays[f"successes_{evaluation.name}"] = np.broadcast_to(np.arange(6) >= 2, (len(EVAL_SEEDS), 20, 6))
         results[cell] = folder / f"{cell.name}.npz"
         np.savez(results[cell], **arrays)
     assert len({cell.name for cell in cells}) == len(cells), "two runs of one name would overwrite each other"
@@ -40,28 +42,43 @@ def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monk
     experiment, folder = EXPERIMENTS[name], tmp_path / "results"
     cells = experiment.cells(3)
     monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 50)
-    report.write(name, f"sb3-htr experiment {name}", experiment, made_up(cells, tmp_path), folder)
-    assert (folder / f"{name}.png").stat().st_size > 10_000
+    report.write(f"sb3-htr experiment {name}", experiment, made_up(cells, tmp_path), folder)
+    assert all((folder / picture).stat().st_size > 10_000 for picture in (f"{name}.png", "reliability.png"))
     raw = np.load(folder / "raw.npz")
     assert {key.split("/")[0] for key in raw.files} == {cell.name for cell in cells}
-    assert all((raw[f"{cell.name}/returns_{cell.explorers[0]}"] == cell.seed).all() for cell in cells)
+    assert all((raw[f"{cell.name}/returns_belief"] == cell.seed).all() for cell in cells)
     summary = json.loads((folder / "summary.json").read_text())
     value = {"last_episode_return": 2.0, "success_rate": 1.0, "episodes_to_first_success": 3.0, "loss_of_stability": 1.0}
     variants = {(cell.variant, str(cell.env_kwargs)): cell for cell in cells}
     for row in summary["rows"]:
         cell = variants[row["variant"], str(row["env_kwargs"])]
-        assert row["iqm"] == value[row["metric"]] and row["n_seeds"] == 3
+        # Elsewhere, all returns are larger by one
+        elsewhere = row["metric"] == "last_episode_return" and bool(row["tested_on"])
+        assert row["iqm"] == value[row["metric"]] + elsewhere and row["n_seeds"] == 3 and row["calibration_error"] == 0.25
         assert (row["method"], row["settings"], row["env_steps"]) == (cell.method, cell.settings, cell.n_timesteps)
         assert row["low"] <= row["iqm"] <= row["high"] and row["method"] in methods()
-    assert len(summary["rows"]) == len(variants) * len(experiment.explorers) * len(value)
+    n_tests = len(experiment.evaluations)
+    assert len(summary["rows"]) == len(variants) * n_tests * len(value)
+    n_settings = len({str(cell.env_kwargs) for cell in cells})
+    assert len(summary["differences"]) == (len(variants) - n_settings) * n_tests
     assert all(difference["low"] <= 0 <= difference["high"] for difference in summary["differences"])
-    assert {difference["of"] for difference in summary["differences"]} == {experiment.variants[0].name or "htr-ser"}
+    for difference in summary["explorer_differences"]:
+        assert difference["explorer"] != difference["of"] and difference["low"] == difference["iqm"] == difference["high"] == 0
+    n_places = len({str(evaluation.tested_on) for evaluation in experiment.evaluations})
+    assert len(summary["explorer_differences"]) == len(variants) * (n_tests - n_places)
+    assert {difference["of"] for difference in summary["differences"]} <= {experiment.variants[0].name or "htr-ser"}
     table = tables.table(summary)
-    assert table.count("| 1.00 [1.00, 1.00] | 3.00 [3.00, 3.00] |") == len(variants) * len(experiment.explorers)
+    assert table.count("| 1.00 [1.00, 1.00] | 3.00 [3.00, 3.00] |") == len(variants) * n_tests
+    assert "3 runs, **fewer than the 5 that a claim needs**" in table and "5 evaluation seeds" in table
+    for place in {str(evaluation.tested_on): evaluation.tested_on for evaluation in experiment.evaluations}.values():
+        here = sum(evaluation.tested_on == place for evaluation in experiment.evaluations)
+        has_column = here < n_tests
+        label = f"| goal distance {place['goal_distance']} |" if place else "| as in training |"
+        assert table.count(label) == len(variants) * here * has_column
     assert f"`sb3-htr experiment {name}`, commit abc" in table
     headline = tables.headline({name: summary})
     shown = [cell for cell in variants.values() if cell.variant in tables.METHODS] if name in tables.ENVS else []
-    assert headline.count("| 2.0 [1.") == len(shown) * len(experiment.explorers)
+    assert headline.count("| 2.0 [1.") == len(shown) * sum(not evaluation.tested_on for evaluation in experiment.evaluations)
     assert all(f"| {cell.n_timesteps:,} | 3 | {cell.variant} | `prior` | 2.0 [1." in headline for cell in shown)
 
 
@@ -79,13 +96,19 @@ def test_the_grid_is_what_it_says(experiment: Any) -> None:
     assert [10 * cell.eval_freq for cell in few] == [cell.eval_freq for cell in cells[: len(few)]]
 
 
-def test_statistics() -> None:
-    assert iqm_interval(np.array([0.0, 10, 10, 10, 100]))[0] == pytest.approx(10)
-    estimate, low, high = iqm_difference(np.array([11.0, 12, 13, 12, 12]), np.array([1.0, 2, 3, 2, 2]))
-    assert estimate == pytest.approx(10) and 8 <= low <= 10 <= high <= 12
-    assert loss_of_stability(np.array([[1.0], [9], [8], [5], [7]])) == 4
-    successes = np.array([[False, True, True], [False, False, False]])
-    assert episodes_to_first_success(successes).tolist() == [2, 4]
+def test_metrics() -> None:
+    raw = {
+        "curve": np.array([[1.0], [9], [8], [5], [7]]),
+        "returns_a": np.arange(6.0).reshape(1, 2, 3),
+        "successes_a": np.array([[[False, True, True], [False, False, False]]]),
+    }
+    values = {name: metric(raw, "a").tolist() for name, metric in METRICS.items()}
+    assert values == {
+        "last_episode_return": [[2, 5]],
+        "success_rate": [[1, 0]],
+        "episodes_to_first_success": [[2, 4]],
+        "loss_of_stability": [[4]],
+    }
 
 
 def test_optimal_return_is_that_of_the_env() -> None:

@@ -97,7 +97,8 @@ def test_relabelling_leaves_the_other_rows_alone_bit_for_bit(relabeller: str) ->
 
 @both_relabellers
 def test_no_transition_is_drawn_twice(relabeller: str) -> None:
-    buffer = filled(n_episodes=12, relabel_probability=1.0, relabeller=relabeller)
+    settings = {"elsewhere": 0.0} if relabeller == "SingleEpisodeRelabelling" else {}
+    buffer = filled(n_episodes=12, relabel_probability=1.0, relabeller={"name": relabeller, **settings})
     data = buffer.sample(16, meta_batch_size=32, context_size=20)
     for drawn in (data, data.context):
         rows = th.cat([drawn.observations, drawn.actions], dim=1)

@@ -46,7 +46,7 @@ def test_every_reward_is_that_of_one_task_per_row(
 
 
 def test_context_and_rl_batch_come_from_one_episode() -> None:
-    data = filled(n_episodes=12, **relabelling()).sample(16, meta_batch_size=32, context_size=20)
+    data = filled(n_episodes=12, **relabelling(elsewhere=0.0)).sample(16, meta_batch_size=32, context_size=20)
     context, batch = (
         by_task(np.column_stack([drawn.observations, drawn.actions, drawn.rewards]), drawn.lengths)
         for drawn in (data.context, data)
@@ -54,6 +54,28 @@ def test_context_and_rl_batch_come_from_one_episode() -> None:
     for episode, steps in zip(context, batch, strict=True):
         assert len(episode) == 20 and len(steps) == 16
         assert {tuple(step) for step in steps} <= {tuple(step) for step in episode}
+
+
+def test_a_share_of_the_rl_batch_comes_from_anywhere_under_the_same_task() -> None:
+    buffer = filled(n_episodes=24, **relabelling(elsewhere=0.25))
+    data = buffer.sample(16, meta_batch_size=200, context_size=20)
+    contexts, batches = (
+        by_task(np.column_stack([drawn.observations, drawn.actions]), drawn.lengths) for drawn in (data.context, data)
+    )
+    foreign = [
+        len({tuple(step) for step in batch} - {tuple(step) for step in context})
+        for context, batch in zip(contexts, batches, strict=True)
+    ]
+    assert 0.15 < np.mean(foreign) / 16 < 0.3, "a few of any are of that episode"
+    reached, given, lengths = trajectory(data.context).next_observations, data.context.rewards, data.context.lengths
+    for places, rewards, next_obs, rl_rewards in zip(
+        *(by_task(x, lengths) for x in (reached, given)),
+        *(by_task(x, data.lengths) for x in (data.next_observations, data.rewards)),
+        strict=True,
+    ):
+        (goal,) = np.unique(places[rewards == 1], axis=0)
+        distance = np.linalg.norm(next_obs - goal, axis=1)
+        np.testing.assert_allclose(rl_rewards, np.where(distance < FAMILY.goal_radius, 1 - distance, 0), atol=1e-5)
 
 
 def test_a_batch_larger_than_an_episode_is_the_whole_episode_once() -> None:

@@ -14,7 +14,7 @@ from sb3_htr.common.normalizer import ObservationNormalizer
 from sb3_htr.common.type_aliases import Context
 from sb3_htr.common.vec_env import make_task_vec_env
 
-NORMALIZED = {"policy_kwargs": with_policy(normalize_observations=True)}
+NOT_NORMALIZED = {"policy_kwargs": with_policy(normalize_observations=False)}
 
 
 def normalizer(model: PEARL) -> ObservationNormalizer:
@@ -24,7 +24,7 @@ def normalizer(model: PEARL) -> ObservationNormalizer:
 
 @pytest.fixture
 def trained(tiny_pearl: MakePEARL) -> PEARL:
-    return tiny_pearl(**NORMALIZED).learn(2 * ROLLOUT)
+    return tiny_pearl().learn(2 * ROLLOUT)
 
 
 def test_statistics_follow_what_is_acted_on_in_training(tiny_pearl: MakePEARL) -> None:
@@ -35,7 +35,7 @@ def test_statistics_follow_what_is_acted_on_in_training(tiny_pearl: MakePEARL) -
         acted_on.append(names["step"].observations.copy())
         return True
 
-    model = tiny_pearl(**NORMALIZED).learn(2 * ROLLOUT, callback=note)
+    model = tiny_pearl().learn(2 * ROLLOUT, callback=note)
     obs = np.concatenate(acted_on)
     assert len(obs) == model.num_timesteps == 2 * ROLLOUT
     np.testing.assert_allclose(normalizer(model).count, len(obs), rtol=1e-6)
@@ -49,7 +49,7 @@ def test_statistics_follow_what_is_acted_on_in_training(tiny_pearl: MakePEARL) -
 
 def test_every_network_sees_normalized_observations(trained: PEARL, tiny_pearl: MakePEARL) -> None:
     """With them, networks without normalization do the same."""
-    plain = tiny_pearl()
+    plain = tiny_pearl(**NOT_NORMALIZED)
     weights = {key: value for key, value in trained.policy.state_dict().items() if not key.startswith("normalizer.")}
     plain.policy.load_state_dict(weights)
     obs = np.random.default_rng(0).normal(0, 0.5, (9, 2)).astype(np.float32)
@@ -108,7 +108,7 @@ def test_they_are_saved_with_the_weights(trained: PEARL, tmp_path: Path) -> None
 
 
 def test_without_it_observations_are_as_they_are(tiny_pearl: MakePEARL) -> None:
-    policy = tiny_pearl().learn(ROLLOUT).policy
+    policy = tiny_pearl(**NOT_NORMALIZED).learn(ROLLOUT).policy
     assert policy.normalizer is None and policy.normalize(obs := th.randn(3, 2)) is obs
     assert not [name for name in policy.state_dict() if name.startswith("normalizer")]
 

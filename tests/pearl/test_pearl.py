@@ -47,7 +47,7 @@ class Counter(BaseCallback):
         {"learning_rate": lambda remaining: 1e-3 * remaining},
         {"target_update_interval": 2, "explorer": PRIOR, "train_explorer": PRIOR},
         {"train_explorer": "belief"},
-        {"policy_kwargs": with_policy(normalize_observations=True)},
+        {"policy_kwargs": with_policy(normalize_observations=False)},
         {"replay_buffer_kwargs": {"relabel_probability": 0.0, "rl_reward_type": "dense"}},
         {"replay_buffer_kwargs": {"relabeller": {"name": "SingleEpisodeRelabelling", "hindsight_task_strategy": "final"}}},
         {"replay_buffer_kwargs": {"relabel_probability": 1.0, "relabeller": EpisodeClustering()}},
@@ -65,8 +65,8 @@ def test_learn_changes_every_network(tiny_pearl: MakePEARL, kwargs: dict[str, An
 
 
 def test_the_actor_does_not_shape_z(tiny_pearl: MakePEARL) -> None:
-    """It sees z detached: where the critics do not ask for z and the KL term is off, the encoder has no gradient."""
-    model = tiny_pearl(kl_coef=0.0).learn(2 * ROLLOUT)
+    """It sees z detached: where neither critics nor reward model ask for it and the KL term is off, there is no gradient."""
+    model = tiny_pearl(kl_coef=0.0, reward_coef=0.0).learn(2 * ROLLOUT)
     obs_dim, latent_dim = 2, model.policy.latent_dim
     with th.no_grad():
         for network in (*model.critic.networks, *model.critic_target.networks):

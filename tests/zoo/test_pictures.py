@@ -4,6 +4,7 @@ import warnings
 from pathlib import Path
 
 import gymnasium as gym
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
@@ -16,7 +17,9 @@ from sb3_htr import PEARL
 from sb3_htr.adaptation.evaluation import AdaptationRecord
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.commands.plot import check_same_settings
-from sb3_htr.zoo.plots import adaptation, curves
+from sb3_htr.zoo.plots import adaptation, curves, style
+from sb3_htr.zoo.plots.style import curve_styles
+from sb3_htr.zoo.run.method import methods
 
 
 @pytest.fixture
@@ -84,7 +87,7 @@ def test_curves_say_what_they_show(drawn: list[Figure], monkeypatch: pytest.Monk
         (3, 2, "env; IQM over seeds, 95 % interval"),
     ):
         zeros = np.zeros((n_seeds, n_points))
-        plots_of = {"a": curves.Curve(np.arange(n_points), zeros, zeros)}
+        plots_of = {"a": curves.Curve(np.arange(n_points), zeros, zeros, "htr-ser")}
         curves.plot_curves(plots_of, Path("x.png"), "env", "x", ("return", "share of tasks solved (%)"))
         left, right = drawn[-1].axes
         assert drawn[-1].get_suptitle() == said
@@ -93,11 +96,28 @@ def test_curves_say_what_they_show(drawn: list[Figure], monkeypatch: pytest.Monk
         assert right.get_ylim() == (-4, 104)
 
 
+def test_a_method_has_one_colour_in_all_pictures() -> None:
+    every = dict(zip(methods(), curve_styles(list(methods())), strict=True))
+    assert len(set(every.values())) == len(every), "no two methods look alike"
+    assert every["htr-ser-prior"] == (every["htr-ser"][0], "--")
+    for name, own in every.items():
+        other, again = curve_styles(["mine", name])
+        assert again == own != other
+        first, second = curve_styles([name, name])
+        assert first == own != second, "two settings of one method are told apart"
+
+
+@pytest.mark.parametrize(("kind", "begin"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")])
+def test_the_name_of_a_picture_says_which_kind_it_is(kind: str, begin: bytes, tmp_path: Path) -> None:
+    style.save(plt.figure(), tmp_path / f"picture.{kind}")
+    assert (tmp_path / f"picture.{kind}").read_bytes().startswith(begin)
+
+
 def test_plot_draws_all_pictures_of_an_agent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["plot", *NOWHERE, "--n-episodes", "6", "-o", str(tmp_path)]) == 0
-    names = {"adaptation_curve.png", "adaptation_paths.png", "latent_space.png"}
+    assert main(["plot", *NOWHERE, "--n-episodes", "6", "-o", str(tmp_path), "--format", "svg"]) == 0
+    names = {"adaptation_curve.svg", "adaptation_paths.svg", "latent_space.svg"}
     assert {path.name for path in tmp_path.iterdir()} == names
-    assert all(path.stat().st_size > 10_000 for path in tmp_path.iterdir())
+    assert all(path.stat().st_size > 10_000 and "<svg" in path.read_text() for path in tmp_path.iterdir())
     assert "No learning curves" in capsys.readouterr().out
 
 

@@ -124,8 +124,8 @@ def _open_window(agent: TrainedAgent, fps: float | None) -> "tuple[Window, Capti
 
         return Window(f"sb3-htr enjoy {agent.env_id}", fps or agent.make_env().metadata.get("render_fps", 30)), Captioner()
     except ModuleNotFoundError as error:
-        reason = f"{error.name} is not installed (pip install 'sb3_htr[plots]')"
-    except (OSError, ImportError) as error:
+        reason = f"{error.name} is not installed (pip install 'sb3_htr[video]')"
+    except OSError as error:
         reason = str(error)
     print(f"Numbers only: {reason}. `sb3-htr record` films without a screen.")
     return None, None

@@ -21,6 +21,7 @@ EXAMPLE = """  sb3-htr plot --env SparsePointRobot-v0                  an agent 
   sb3-htr plot runs/htr runs/sparse -l HTR "no relabelling"    the runs in a folder are the seeds of its curve
   sb3-htr plot runs --only learning -o pictures"""
 PICTURES = ("learning", "adaptation", "paths", "latent")
+FORMATS = ("png", "svg", "pdf")
 
 
 class Adapted(NamedTuple):
@@ -135,7 +136,7 @@ def learning_curve(label: str, agents: Sequence[TrainedAgent]) -> Curve | None:
     at = [np.isin(run["timesteps"], steps) for run in runs]
     returns = np.stack([run["returns"][i][:, :, -1].mean(axis=1) for run, i in zip(runs, at, strict=True)])
     successes = np.stack([run["successes"][i][:, :, -1].mean(axis=1) for run, i in zip(runs, at, strict=True)])
-    return Curve(steps / 1000, returns, successes)
+    return Curve(steps / 1000, returns, successes, agents[0].method)
 
 
 def main(argv: Sequence[str]) -> None:
@@ -146,6 +147,7 @@ def main(argv: Sequence[str]) -> None:
     add_adaptation_arguments(parser, n_episodes=20)
     parser.add_argument("-l", "--labels", nargs="+", metavar="NAME", help="names of the curves (default: the folders')")
     parser.add_argument("-o", "--output", type=Path, default=Path("plots"), help="folder for the pictures (default: plots)")
+    parser.add_argument("--format", choices=FORMATS, default="png", help="of the pictures (default: png)")
     parser.add_argument("--only", nargs="+", choices=PICTURES, default=PICTURES, help="pictures to draw (default: all)")
     args = parser.parse_args(argv)
     groups = groups_of(parser, args)
@@ -153,7 +155,7 @@ def main(argv: Sequence[str]) -> None:
     written: list[Path] = []
 
     def new(name: str) -> Path:
-        written.append(args.output / name)
+        written.append(args.output / f"{name}.{args.format}")
         return written[-1]
 
     if "learning" in args.only:
@@ -162,20 +164,27 @@ def main(argv: Sequence[str]) -> None:
         if learning:
             names = [agent.record["hyperparams"]["explorer"]["name"] for agents in groups.values() for agent in agents]
             about = f"{env_id}, validation tasks, {about_explorers(names)}"
-            plot_curves(learning, new("learning_curves.png"), about, "thousand env steps of meta-training", labels)
+            plot_curves(learning, new("learning_curves"), about, "thousand env steps of meta-training", labels)
         else:
             print("No learning curves: there is no evaluations.npz of a training.")
     if set(args.only) != {"learning"}:
         adapted = {label: [adapt(agent, args) for agent in agents] for label, agents in groups.items()}
-        plot_adapted(args, env_id, adapted, new)
+        plot_adapted(args, env_id, adapted, {label: agents[0].method for label, agents in groups.items()}, new)
     print("Pictures: " + (", ".join(str(path) for path in written) or "none"))
 
 
-def plot_adapted(args: argparse.Namespace, env_id: str, adapted: dict[str, list[Adapted]], new: Callable[[str], Path]) -> None:
+def plot_adapted(
+    args: argparse.Namespace,
+    env_id: str,
+    adapted: dict[str, list[Adapted]],
+    method_of: dict[str, str],
+    new: Callable[[str], Path],
+) -> None:
     """
     :param args: of the command
     :param env_id: env
     :param adapted: label and adaptations of the runs of each curve
+    :param method_of: label and method of each curve
     :param new: gives the path of a picture
     """
     label, first = next((label, runs[0]) for label, runs in adapted.items())
@@ -183,22 +192,22 @@ def plot_adapted(args: argparse.Namespace, env_id: str, adapted: dict[str, list[
     about = f"{env_id}, {len(first.tasks)} {args.tasks} tasks, {used}"
     if "adaptation" in args.only:
         if sum(map(len, adapted.values())) == 1:
-            plot_adaptation_curve(first.record, new("adaptation_curve.png"), about)
+            plot_adaptation_curve(first.record, new("adaptation_curve"), about)
         else:
             curves = {}
             for name, runs in adapted.items():
                 returns = np.stack([run.record.returns.mean(axis=0) for run in runs])
                 successes = np.stack([run.record.successes.mean(axis=0) for run in runs])
-                curves[name] = Curve(np.arange(1, args.n_episodes + 1), returns, successes)
+                curves[name] = Curve(np.arange(1, args.n_episodes + 1), returns, successes, method_of[name])
             labels = ("return", "share of tasks solved (%)")
-            plot_curves(curves, new("adaptation_curve.png"), about, "adaptation episode", labels)
+            plot_curves(curves, new("adaptation_curve"), about, "adaptation episode", labels)
     if "paths" in args.only and first.tasks.shape[1] == 2:
         title = f"{env_id}, {label}, {args.tasks} tasks, explorer {first.explorer}"
-        plot_adaptation_paths(first.record, first.tasks, first.goal_radius, first.start, new("adaptation_paths.png"), title)
+        plot_adaptation_paths(first.record, first.tasks, first.goal_radius, first.start, new("adaptation_paths"), title)
     found = first.found
     if "latent" in args.only and found.sum() < 2:
         print(f"No latent space: {label} found the reward of {found.sum()} of {len(found)} tasks.")
     elif "latent" in args.only:
         tasks, posterior = first.tasks[found], (first.mean[found], first.deviation[found])
         title = f"{env_id}: posteriors of {found.sum()} {args.tasks} tasks"
-        plot_latent_space(tasks, *posterior, first.known_z, new("latent_space.png"), title)
+        plot_latent_space(tasks, *posterior, first.known_z, new("latent_space"), title)

@@ -110,7 +110,7 @@ def plot_adaptation_paths(
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
     figure.suptitle(title, fontsize=11)
     for axes in grid[-1]:
-        axes.set_xlabel("x (length)")
+        axes.set_xlabel("x (units of length)")
     for axes in grid[:, 0]:
-        axes.set_ylabel("y (length)")
+        axes.set_ylabel("y (units of length)")
     save(figure, path)

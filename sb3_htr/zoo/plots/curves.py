@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sb3_htr.zoo.plots.intervals import iqm_interval
-from sb3_htr.zoo.plots.style import COLOURS, save, span_unit_if_flat
+from sb3_htr.zoo.plots.style import curve_styles, save, span_unit_if_flat
 
 # With more points than these, a curve has no markers
 MAX_MARKERS = 15
@@ -20,12 +20,12 @@ def band(axes: plt.Axes, x: np.ndarray, scores: np.ndarray, colour: str, style: 
 
     :param axes: where
     :param x: (n,)
-    :param scores: (n_runs, n)
+    :param scores: (n_runs, n) or (n_runs, n_eval_seeds, n_tasks, n)
     :param colour: of line and band
     :param style: of the line, matplotlib's
     :param label: for the legend
     """
-    points = np.array([iqm_interval(column) for column in scores.T])
+    points = np.array([iqm_interval(scores[..., i]) for i in range(len(x))])
     axes.plot(x, points[:, 0], style, color=colour, label=label, marker="o" if len(x) <= MAX_MARKERS else "", markersize=4)
     axes.fill_between(x, points[:, 1], points[:, 2], color=colour, alpha=0.2, linewidth=0)
 
@@ -51,11 +51,13 @@ class Curve(NamedTuple):
     :param x: (n,)
     :param returns: (n_runs, n)
     :param successes: (n_runs, n), share of tasks solved
+    :param method: of the runs, which gives the curve its colour
     """
 
     x: np.ndarray
     returns: np.ndarray
     successes: np.ndarray
+    method: str
 
 
 def plot_curves(curves: dict[str, Curve], path: Path, title: str, x_label: str, y_labels: tuple[str, str]) -> None:
@@ -69,8 +71,8 @@ def plot_curves(curves: dict[str, Curve], path: Path, title: str, x_label: str, 
     :param y_labels: of returns and successes
     """
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4.2), layout="constrained")
-    for i, (label, curve) in enumerate(curves.items()):
-        colour, style = COLOURS[i % len(COLOURS)], ("-", "--", ":")[i // len(COLOURS) % 3]
+    styles = curve_styles([curve.method for curve in curves.values()])
+    for (colour, style), (label, curve) in zip(styles, curves.items(), strict=True):
         label = f"{label} ({len(curve.returns)} seed{'s' * (len(curve.returns) > 1)})"
         band(left, curve.x, curve.returns, colour, style, label)
         band(right, curve.x, 100 * curve.successes, colour, style, label)

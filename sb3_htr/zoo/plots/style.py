@@ -1,5 +1,6 @@
 """What all pictures share."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib
@@ -9,16 +10,32 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 from sb3_htr.common.atomic import atomic_path
+from sb3_htr.zoo.run.method import PRIOR, methods
 
-# Okabe and Ito's colours, told apart by all kinds of colour vision
-COLOURS = ["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999"]
+# Okabe and Ito's colours, told apart by all kinds of colour vision, and three dark ones
+COLOURS = ["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999", "#000000", "#332288", "#882255"]
 BLUE, ORANGE, GREEN, GREY = *COLOURS[:3], COLOURS[6]
+LINES = ("-", "--", ":")
+
+
+def curve_styles(names: Sequence[str]) -> list[tuple[str, str]]:
+    """
+    :param names: what the curves of a picture are of
+    :return: colour and line of each. A method has one colour in all pictures, dashed under PEARL's own protocol; what is no
+        method, or is there already, takes what is left
+    """
+    own = dict(zip((name for name in methods() if not name.endswith(PRIOR)), COLOURS, strict=False))
+    own_styles = {f"{name}{end}": (colour, line) for name, colour in own.items() for end, line in (("", "-"), (PRIOR, "--"))}
+    taken = {own_styles[name] for name in names if name in own_styles}
+    left = iter([style for line in LINES for colour in COLOURS if (style := (colour, line)) not in taken])
+    first = [name in own_styles and name not in names[:i] for i, name in enumerate(names)]
+    return [own_styles[name] if is_first else next(left) for name, is_first in zip(names, first, strict=True)]
 
 
 def save(figure: plt.Figure, path: Path) -> None:
     """
     :param figure: to save and close
-    :param path: picture to write
+    :param path: picture to write; its suffix says which kind, ``.png``, ``.svg`` or ``.pdf``
     """
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=120, bbox_inches="tight")

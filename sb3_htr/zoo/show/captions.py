@@ -54,7 +54,7 @@ class Captioner:
         self._bar(draw, (bars, y + 0.2 * size, right, y + 1.0 * size), moment.deviation / max(self._deviation, 1e-9))
 
         y += size * (LINE + 0.3)
-        draw.text((left, y + 0.3 * size), "return of each episode", INK, font)
+        draw.text((left, y + 0.3 * size), f"return, 0 to {self.top_return:.1f}", INK, font)
         self._history(draw, moment, bars, right, y, 1.6 * size)
         return np.asarray(image)
 

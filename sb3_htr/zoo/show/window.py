@@ -1,7 +1,10 @@
 """A window that shows frames, where there is a screen."""
 
-import matplotlib.pyplot as plt
+import os
+
 import numpy as np
+
+from htr_envs.headless import has_screen
 
 
 class Window:
@@ -10,30 +13,35 @@ class Window:
 
     :param title: of the window
     :param fps: frames per second, at most
-    :raises OSError: if no window can be opened
+    :raises OSError: if there is no screen
     """
 
     def __init__(self, title: str, fps: float) -> None:
-        # matplotlib falls back on pictures in memory where it finds no screen
-        if plt.get_backend().lower() == "agg":
-            raise OSError("no screen or no window toolkit (such as tkinter) was found")
-        self.pause = 1 / fps
-        plt.rcParams["toolbar"] = "None"
-        self.figure, axes = plt.subplots(num=title, layout="tight")
-        axes.set_axis_off()
-        self.image = axes.imshow(np.full((2, 2, 3), 255, dtype=np.uint8), interpolation="nearest")
+        # SDL would draw into memory that nobody sees, unless it is told to
+        if not has_screen() and "SDL_VIDEODRIVER" not in os.environ:
+            raise OSError("no screen was found")
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+        import pygame
+
+        self.title, self.fps, self.pygame = title, fps, pygame
+        self.clock = pygame.time.Clock()
+        pygame.display.init()
 
     def show(self, frame: np.ndarray) -> bool:
         """
         :param frame: (height, width, 3) uint8
-        :return: whether the window is still open
+        :return: whether nobody has closed the window
         """
-        height, width = frame.shape[:2]
-        self.image.set_data(frame)
-        self.image.set_extent((0.0, float(width), float(height), 0.0))
-        plt.pause(self.pause)
-        return bool(plt.fignum_exists(self.figure.number))
+        display, size = self.pygame.display, frame.shape[1::-1]
+        surface = display.get_surface()
+        if surface is None:
+            surface = display.set_mode(size)
+            display.set_caption(self.title)
+        surface.blit(self.pygame.image.frombuffer(frame.tobytes(), size, "RGB"), (0, 0))
+        display.flip()
+        self.clock.tick(self.fps)
+        return not any(event.type == self.pygame.QUIT for event in self.pygame.event.get())
 
     def close(self) -> None:
         """Close it."""
-        plt.close(self.figure)
+        self.pygame.display.quit()

@@ -1,0 +1,61 @@
+"""The default explorer with one of its parts taken out. They are experiments, and not for use."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch as th
+
+from sb3_htr.adaptation.explorers import Belief, Explorer
+from sb3_htr.adaptation.knowledge import Particles
+
+
+@dataclass
+class TrainingTasksAlone(Belief):
+    """No particles of hindsight tasks."""
+
+    def start(self) -> None:
+        super().start()
+        z, gain, returns, log_prior, kept = self.particles
+        if kept.any():
+            self.particles = Particles(z[kept], gain[kept][:, kept], returns[kept][:, kept], log_prior[kept], kept[kept])
+            self._tasks, self.log_weights = self._tasks[kept], self.log_weights[:, kept]
+            self._tried = self._tried[:, kept.cpu().numpy()]
+
+
+@dataclass
+class UniformPrior(Belief):
+    """All particles are as likely beforehand."""
+
+    def start(self) -> None:
+        super().start()
+        self.log_weights[:] = 0
+
+
+@dataclass
+class NoPosterior(Belief):
+    """The encoder's posterior mean is never acted with."""
+
+    def _end(self, envs: np.ndarray) -> None:
+        super()._end(envs)
+        self._has_proposal[envs] = False
+
+
+@dataclass
+class NoValue(Belief):
+    """Before the first reward, what an episode is expected to earn alone: not how soon, nor whether the policy gets there."""
+
+    def _search(self, envs: np.ndarray, obs: np.ndarray) -> None:
+        if len(envs):
+            with th.no_grad():
+                best = (self.weights(envs) @ self.particles.gain.T).argmax(dim=1)
+            chosen = self.particles.z[best].cpu().numpy()
+            self._turned[envs] |= ~self._at_start[envs] & (chosen != self.z[envs]).any(axis=1)
+            self.z[envs] = chosen
+
+
+ABLATIONS: dict[str, Explorer] = {
+    "belief, training tasks alone": TrainingTasksAlone(),
+    "belief, uniform prior": UniformPrior(),
+    "belief, no posterior": NoPosterior(),
+    "belief, no value": NoValue(),
+}

@@ -1,0 +1,91 @@
+"""One run of an experiment: what is trained, and how the final model is evaluated."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+KwArgs = dict[str, Any]
+
+
+class Evaluation(NamedTuple):
+    """
+    How a final model adapts to the test tasks.
+
+    :param explorer: name
+    :param tested_on: arguments of the env that are other than in training
+    """
+
+    explorer: str
+    tested_on: KwArgs
+
+    @property
+    def name(self) -> str:
+        """In raw results."""
+        return " ".join([self.explorer, *(f"{key}={value}" for key, value in self.tested_on.items())])
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """
+    One training run and the evaluations of its final model.
+
+    :param experiment: name of the experiment
+    :param models_of: name of the experiment whose runs these are; often the same
+    :param env_id: registered env
+    :param method: name in hyperparams/methods.yml
+    :param variant: name in tables and folders
+    :param seed: seed of the run
+    :param n_timesteps: budget of env steps
+    :param eval_freq: env steps between evaluations on the validation tasks
+    :param settings: hyperparameters, joined with those of env and method
+    :param env_kwargs: arguments of the env
+    :param evaluations: what is done with the final model; one row of results for each
+    """
+
+    experiment: str
+    models_of: str
+    env_id: str
+    method: str
+    variant: str
+    seed: int
+    n_timesteps: int
+    eval_freq: int
+    settings: KwArgs
+    env_kwargs: KwArgs
+    evaluations: tuple[Evaluation, ...]
+
+    @property
+    def name(self) -> str:
+        """Of its folder."""
+        kwargs = "".join(f"-{key}{value}" for key, value in self.env_kwargs.items())
+        return re.sub(r"[^\w.=-]+", "_", f"{self.variant}{kwargs}-seed{self.seed}".replace(" ", ""))
+
+    def run_folder(self, runs: Path) -> Path:
+        """
+        :param runs: folder of all experiments' runs
+        :return: log folder of its training
+        """
+        return runs / self.models_of / self.name
+
+    def result(self, runs: Path) -> Path:
+        """
+        :param runs: folder of all experiments' runs
+        :return: file of its raw results
+        """
+        return runs / self.experiment / f"{self.name}.npz"
+
+    def training(self, folder: Path) -> list[str]:
+        """
+        :param folder: log folder
+        :return: arguments of ``sb3-htr train``
+        """
+        settings = [f"{key}:{value!r}" for key, value in self.settings.items()]
+        kwargs = [f"{key}:{value!r}" for key, value in self.env_kwargs.items()]
+        return [
+            *("--env", self.env_id, "--method", self.method),
+            *("-f", str(folder), "--verbose", "0", "-n", str(self.n_timesteps)),
+            *("--seed", str(self.seed), "--eval-freq", str(self.eval_freq)),
+            *(["-params", *settings] if settings else []),
+            *(["--env-kwargs", *kwargs] if kwargs else []),
+        ]

@@ -1,0 +1,77 @@
+"""How every final model is judged: on test tasks that decided nothing, with several seeds, by each explorer alike."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from sb3_htr.adaptation.evaluation import evaluate_adaptation
+from sb3_htr.common.checks import get_task_family
+from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.experiments.ablations import ABLATIONS
+from sb3_htr.experiments.calibration import calibration
+from sb3_htr.experiments.cell import Cell, KwArgs
+from sb3_htr.pearl.pearl import PEARL
+
+# A final model adapts to all test tasks once for each: of starting states, and of all that an explorer draws
+EVAL_SEEDS = (1, 2, 3, 4, 5)
+# A table of fewer says so
+MIN_RUNS = 5
+
+Raw = Mapping[str, np.ndarray]
+
+
+def evaluate(cell: Cell, model: PEARL) -> KwArgs:
+    """
+    :param cell: says which evaluations
+    :param model: at the end of its training
+    :return: ``returns_<evaluation>`` float32 and ``successes_<evaluation>`` bool, (n_eval_seeds, n_tasks, n_episodes); and
+        ``calibration``, see :func:`sb3_htr.experiments.calibration.calibration`
+    """
+    arrays: KwArgs = {}
+    for evaluation in cell.evaluations:
+        env_kwargs = {**cell.env_kwargs, **evaluation.tested_on}
+        family = get_task_family(make_task_vec_env(cell.env_id, env_kwargs=env_kwargs))
+        env = make_task_vec_env(cell.env_id, len(family.test_tasks), env_kwargs=env_kwargs)
+        explorer = ABLATIONS.get(evaluation.explorer, evaluation.explorer)
+        records = [evaluate_adaptation(model, env, explorer=explorer, seed=seed) for seed in EVAL_SEEDS]
+        returns, successes = (np.stack(arrays) for arrays in zip(*records, strict=True))
+        arrays |= {f"returns_{evaluation.name}": returns.astype(np.float32), f"successes_{evaluation.name}": successes}
+    return {**arrays, "calibration": calibration(model, cell.env_id, cell.env_kwargs)}
+
+
+def last_episode_return(raw: Raw, evaluation: str) -> np.ndarray:
+    """(n_eval_seeds, n_tasks), return of the last adaptation episode."""
+    return raw[f"returns_{evaluation}"][..., -1]
+
+
+def success_rate(raw: Raw, evaluation: str) -> np.ndarray:
+    """(n_eval_seeds, n_tasks), whether the last adaptation episode solved the task."""
+    return raw[f"successes_{evaluation}"][..., -1].astype(np.float64)
+
+
+def episodes_to_first_success(raw: Raw, evaluation: str) -> np.ndarray:
+    """(n_eval_seeds, n_tasks), the first episode that solved the task; one more than there are if none did."""
+    successes = raw[f"successes_{evaluation}"]
+    return np.where(successes.any(axis=-1), successes.argmax(axis=-1) + 1, successes.shape[-1] + 1)
+
+
+def loss_of_stability(raw: Raw, evaluation: str) -> np.ndarray:
+    """(1, 1), how far the worst of the last three evaluations on validation tasks is below the best of all."""
+    means = raw["curve"].mean(axis=1)
+    return np.atleast_2d(means.max() - means[-3:].min())
+
+
+METRICS: dict[str, Callable[[Raw, str], np.ndarray]] = {
+    metric.__name__: metric for metric in (last_episode_return, success_rate, episodes_to_first_success, loss_of_stability)
+}
+
+
+def scores(raws: list[Any], metric: str, evaluation: str) -> np.ndarray:
+    """
+    :param raws: raw results of runs
+    :param metric: name
+    :param evaluation: name
+    :return: (n_runs, n_eval_seeds, n_tasks)
+    """
+    return np.stack([METRICS[metric](raw, evaluation) for raw in raws])

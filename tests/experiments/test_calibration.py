@@ -1,0 +1,39 @@
+"""The reliability diagram compares what the reward model says with what happened."""
+
+import numpy as np
+import pytest
+import torch as th
+
+from helpers import ENV_ID
+from sb3_htr import PEARL
+from sb3_htr.experiments.calibration import N_BINS, N_EPISODES, calibration, expected_calibration_error
+
+
+@pytest.fixture
+def model() -> PEARL:
+    """It moves, and knows nothing."""
+    return PEARL("MlpPolicy", ENV_ID, policy_kwargs={"net_arch": [8]}, seed=0)
+
+
+def test_probabilities_are_compared_with_what_happened(model: PEARL, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Goals are so near that their discs overlap at the start: some states solve some tasks."""
+    near = {"goal_distance": 0.15, "n_validation_tasks": 6}
+    n, probability, successes = (bins := calibration(model, ENV_ID, near)).T
+    n_solved = n.sum() / (6 * N_EPISODES * 20)
+    assert n_solved in range(1, 7) and 0 < successes.sum() < n.sum() and (successes <= n).all()
+    edges = np.linspace(0, 1, N_BINS + 1)
+    assert (probability >= edges[:-1] * n).all() and (probability <= edges[1:] * n).all()
+
+    def know_nothing(states: th.Tensor, tasks: th.Tensor) -> th.Tensor:
+        return th.zeros(*states.shape[:-1], len(tasks))
+
+    monkeypatch.setattr(model.policy.reward_model, "success_logits", know_nothing)
+    half = calibration(model, ENV_ID, near)
+    assert half[N_BINS // 2].tolist() == [n.sum(), n.sum() / 2, successes.sum()] and half.sum() == half[N_BINS // 2].sum()
+    assert expected_calibration_error(half) == pytest.approx(abs(0.5 - successes.sum() / n.sum()))
+    assert expected_calibration_error(bins) == pytest.approx(np.abs(probability - successes).sum() / n.sum())
+
+
+def test_a_model_that_solves_nothing_has_no_diagram(model: PEARL) -> None:
+    bins = calibration(model, ENV_ID, {"goal_distance": 9.0})
+    assert not bins.any() and np.isnan(expected_calibration_error(bins))

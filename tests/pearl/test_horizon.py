@@ -1,0 +1,63 @@
+"""Settings that follow from the time limit."""
+
+from typing import Any
+
+import gymnasium as gym
+import pytest
+
+from helpers import ENV_ID, TINY
+from sb3_htr import PEARL
+from sb3_htr.pearl.horizon import settings_for, timesteps_for
+
+NAMES = ("gamma", "n_episodes_per_task", "learning_starts", "gradient_steps", "batch_size", "context_size")
+
+
+def make(max_episode_steps: int, **given: Any) -> PEARL:
+    env = gym.make(ENV_ID, max_episode_steps=max_episode_steps)
+    return PEARL("MlpPolicy", env, policy_kwargs=TINY["policy_kwargs"], **given)
+
+
+@pytest.mark.parametrize(
+    ("max_episode_steps", "expected"),
+    [
+        (1, (0.0, 10, 200, 10, 1, 1)),
+        (20, (0.9, 10, 4000, 200, 20, 20)),
+        (50, (0.96, 8, 8000, 400, 24, 24)),
+        (200, (0.98, 2, 8000, 400, 24, 24)),
+        (1000, (0.98, 2, 40_000, 2000, 24, 24)),
+    ],
+)
+def test_what_is_not_given_follows_from_the_time_limit(max_episode_steps: int, expected: tuple[float, ...]) -> None:
+    model = make(max_episode_steps)
+    assert tuple(getattr(model, name) for name in NAMES) == pytest.approx(expected)
+
+
+def test_what_is_given_stays() -> None:
+    given: dict[str, Any] = dict(zip(NAMES, (0.5, 3, 7, 11, 5, 9), strict=True))
+    model = make(200, **given)
+    assert {name: getattr(model, name) for name in NAMES} == given
+    with pytest.raises(ValueError, match=r"gamma is 1\.5, expected a number from 0 to 1"):
+        make(20, gamma=1.5)
+
+
+def test_a_rollout_has_as_many_updates_per_step_at_any_time_limit() -> None:
+    for max_episode_steps in (5, 20, 77, 200, 1000):
+        settings = settings_for(max_episode_steps, 20)
+        steps = 20 * settings["n_episodes_per_task"] * max_episode_steps
+        assert steps / settings["gradient_steps"] == pytest.approx(20, rel=0.05)
+        assert timesteps_for(max_episode_steps) >= 10 * steps, "a training has many rollouts"
+
+
+def test_a_loaded_model_keeps_its_own(tmp_path: Any) -> None:
+    model = make(20, gamma=0.7)
+    model.save(tmp_path / "model")
+    loaded = PEARL.load(tmp_path / "model", env=gym.make(ENV_ID, max_episode_steps=200))
+    assert {name: getattr(loaded, name) for name in NAMES} == {name: getattr(model, name) for name in NAMES}
+
+
+def test_learn_has_a_budget_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    monkeypatch.setattr("stable_baselines3.sac.SAC.learn", lambda self, total_timesteps, **_: asked.append(total_timesteps))
+    for max_episode_steps in (20, 200):
+        make(max_episode_steps).learn()
+    assert asked == [150_000, 600_000]

@@ -1,0 +1,59 @@
+"""The examples keep the promises of task families, and the notebook runs."""
+
+import ast
+import importlib
+import inspect
+import json
+import runpy
+from pathlib import Path
+
+import gymnasium as gym
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+from helpers import TINY, with_policy
+from htr_envs import check_task_env
+from sb3_htr import PEARL
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+FAMILIES = {"two_link_arm": "TwoLinkArm-v0", "hidden_target_reacher": "HiddenTargetReacher-v0"}
+
+
+@pytest.mark.parametrize("module", FAMILIES)
+def test_a_family_of_the_examples_is_one(module: str) -> None:
+    example = importlib.import_module(f"examples.{module}")
+    # What it imports as a script, before it trains for minutes
+    for node in ast.walk(ast.parse(inspect.getsource(example))):
+        if isinstance(node, ast.ImportFrom):
+            assert all(hasattr(importlib.import_module(node.module or ""), name.name) for name in node.names), node.module
+    env = gym.make(FAMILIES[module])
+    check_task_env(env)
+    kwargs = {**TINY, "policy_kwargs": with_policy(normalize_observations=True)}
+    model = PEARL("MlpPolicy", env, **kwargs, train_explorer="prior").learn(1)
+    assert model.replay_buffer is not None and model.replay_buffer.size() > 0
+
+
+def test_pictures_of_the_reacher_show_its_target() -> None:
+    importlib.import_module("examples.hidden_target_reacher")
+    env = gym.make("HiddenTargetReacher-v0", render_mode="rgb_array")
+    pictures = []
+    for target in ([0.1, 0.1], [-0.1, 0.1]):
+        env.reset(seed=0, options={"task": target})
+        pictures.append(np.asarray(env.render()))
+    env.close()
+    red = [picture[..., 0] > 2.5 * picture[..., 1:].max(axis=-1) for picture in pictures]
+    right, left = (np.argwhere(shown)[:, 1].mean() for shown in red)
+    assert right > left + 50
+
+
+@pytest.mark.filterwarnings("ignore:No reward was found")
+def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plt, "show", lambda: None)
+    notebook = json.loads((EXAMPLES / "first_steps.ipynb").read_text())
+    cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    # For a moment, in place of half a minute
+    (tmp_path / "notebook.py").write_text("\n".join(cells).replace("learn(30_000)", "learn(4_000)"))
+    runpy.run_path(str(tmp_path / "notebook.py"))
+    plt.close("all")
+    assert not any(cell.get("outputs") for cell in notebook["cells"]), "outputs are not kept: they would go out of date"

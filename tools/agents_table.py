@@ -1,0 +1,98 @@
+"""
+Adapts the agents in trained_agents/ to all test tasks and writes the table in its README.md: ``python tools/agents_table.py``.
+
+Scores are kept in trained_agents/scores.json with the checksum of the file that they are of: only new files are adapted.
+"""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tables import fill
+
+from sb3_htr.adaptation.evaluation import record_adaptation
+from sb3_htr.common.atomic import atomic_path
+from sb3_htr.zoo.run.agents import agent_at
+from sb3_htr.zoo.run.method import methods
+
+AGENTS = Path(__file__).parents[1] / "trained_agents"
+SCORES = AGENTS / "scores.json"
+HEAD = ("file", "env steps", "explorer", "return of the 20th episode", "tasks solved in it", "episodes to the first success")
+N_EPISODES = 20
+
+
+def checksum(path: Path) -> str:
+    """
+    :param path: file
+    :return: its SHA-256
+    """
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def files() -> list[Path]:
+    """
+    :return: the agents, method by method
+    """
+    order = [*methods()]
+    return sorted(AGENTS.glob("*/*.zip"), key=lambda path: (order.index(path.parent.name), path.name))
+
+
+def measure(path: Path) -> dict[str, Any]:
+    """
+    :param path: agent
+    :return: mean scores over all test tasks, by explorer
+    """
+    agent = agent_at(path)
+    model = agent.load()
+    scores = {}
+    for explorer in dict.fromkeys((model.explorer.name, "prior")):
+        returns, successes, _ = record_adaptation(model, agent.make_vec_env(100), None, N_EPISODES, explorer)
+        first = np.where(successes.any(axis=1), successes.argmax(axis=1) + 1, N_EPISODES + 1)
+        scores[explorer] = [float(returns[:, -1].mean()), float(successes[:, -1].mean()), float(first.mean())]
+    return scores
+
+
+def read_scores() -> dict[str, dict[str, Any]]:
+    """
+    :return: checksum and scores of each file that has not changed since
+    """
+    known = json.loads(SCORES.read_text()) if SCORES.exists() else {}
+    now = {str(path.relative_to(AGENTS)): checksum(path) for path in files()}
+    return {name: row for name, row in known.items() if now.get(name) == row["sha256"]}
+
+
+def table(scores: dict[str, dict[str, Any]]) -> str:
+    """
+    :param scores: of :func:`read_scores`
+    :return: Markdown: a line for each agent and explorer, then the commands that made them
+    """
+    lines, commands = ["| " + " | ".join(HEAD) + " |", "| --- " * len(HEAD) + "|"], []
+    for path in files():
+        name, record = str(path.relative_to(AGENTS)), agent_at(path).record
+        measured = scores.get(name, {"explorers": {}})["explorers"]
+        for explorer, (last, solved, first) in measured.items():
+            steps = f"{record['num_timesteps']:,}"
+            lines.append(f"| `{name}` | {steps} | `{explorer}` | {last:.2f} | {solved:.0%} | {first:.1f} |")
+        if not measured:
+            lines.append(f"| `{name}` | {record['num_timesteps']:,} | | not measured by this version | | |")
+        commands.append(record["command"])
+    return "\n".join(lines) + "\n\nThey were made by\n\n" + "".join(f"    {command}\n" for command in commands) + "\n"
+
+
+def main() -> None:
+    """Adapt the files that are new, and write scores and table."""
+    scores = read_scores()
+    for path in files():
+        name = str(path.relative_to(AGENTS))
+        if name not in scores:
+            print(f"Adapting {name}")
+            scores[name] = {"sha256": checksum(path), "explorers": measure(path)}
+    with atomic_path(SCORES) as temporary:
+        temporary.write_text(json.dumps(scores, indent=1, sort_keys=True) + "\n")
+    fill([AGENTS / "README.md"], {"agents": table(scores)})
+
+
+if __name__ == "__main__":
+    main()
