@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory
 
-MAX_STEPS = 200  # for an env without a time limit
+MAX_STEPS = 200  # of an episode that are looked at
 N_DRAWS = 30
 TASK_SETS = ("train_tasks", "validation_tasks", "test_tasks")
 HOOKS = ("sample_tasks", "compute_reward", "is_success", "hindsight_task")
@@ -63,6 +63,9 @@ def _check_interface(env: gym.Env[Any, Any]) -> TaskFamily:
     for what, space in (("observation_space", env.observation_space), ("action_space", env.action_space)):
         flat = isinstance(space, spaces.Box) and len(space.shape) == 1 and space.dtype == np.float32
         _require(flat, f"The {what} must be a one-dimensional float32 Box.")
+    limited = any(env.has_wrapper_attr(name) for name in ("_max_episode_steps", "max_episode_steps"))
+    limited = limited or (env.spec is not None and env.spec.max_episode_steps is not None)
+    _require(limited, "The env has no time limit: register it with max_episode_steps, and pass gymnasium.make(id).")
     return family
 
 

@@ -21,7 +21,7 @@ vec_envs = pytest.mark.parametrize("vec_env_class", [None, DummyVecEnv], ids=["b
 def tiny_rl2(env: Any = None, **kwargs: Any) -> RL2:
     """An RL2 that trains in a moment, 80 steps a rollout."""
     env = make_task_vec_env(ENV_ID, 2, seed=0) if env is None else env
-    settings = {"n_episodes_per_trial": 2, "n_trials_per_rollout": 1, "n_epochs": 1, "seed": 0}
+    settings: dict[str, Any] = {"n_episodes_per_trial": 2, "n_trials_per_rollout": 1, "n_epochs": 1, "seed": 0}
     settings["policy_kwargs"] = {"lstm_hidden_size": 4, "net_arch": [4]}
     return RL2("MlpLstmPolicy", env, **{**settings, **kwargs})
 

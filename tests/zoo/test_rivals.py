@@ -69,7 +69,7 @@ def test_what_is_exported_acts_the_same_and_says_how_to_use_it(
     method: str, runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert main(["export", str(runs / method), "-o", str(tmp_path / "agent"), "--n-episodes", "2"]) == 0
-    run, file = agent_at(runs / method), tmp_path / "agent" / f"{ENV_ID}.zip"
+    run, file = agent_at(runs / method), tmp_path / "agent" / f"{method}-{ENV_ID}.zip"
     ours, theirs = (evaluate_adaptation(agent.load(), ENV_ID, n_episodes=2) for agent in (run, agent_at(file)))
     np.testing.assert_array_equal(ours, theirs)
     card = (file.parent / "README.md").read_text()

@@ -5,7 +5,7 @@ import json
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 from stable_baselines3.common.save_util import load_from_zip_file
@@ -76,7 +76,7 @@ class Algorithm:
                 n_steps = json.loads(archive.read("data")).get("num_timesteps", 0)
             model: Rival = model_class(given.get("policy", model_class.DEFAULT_POLICY), env, device=device, **settings)
             _, weights, _ = load_from_zip_file(path, load_data=False, device=model.device)
-            model.policy.load_state_dict(weights["policy"])
+            model.policy.load_state_dict(cast(Any, weights["policy"]))
         except (KeyError, TypeError, AssertionError, AttributeError, RuntimeError, ValueError, zipfile.BadZipFile) as error:
             raise ValueError(f"{path} is damaged, or no {self.name} model with the settings of its record: {error}") from None
         model.num_timesteps = n_steps if type(n_steps) is int else 0

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import shutil
 import signal
 import sys
 import threading
@@ -63,6 +64,7 @@ class MetaExperimentManager(ExperimentManager):
         self._method_name = method
         self._unique = kwargs.get("uuid_str", "")
         self.resumed = resumed
+        self._claimed: Path | None = None
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """
@@ -76,7 +78,12 @@ class MetaExperimentManager(ExperimentManager):
         given, trial_id = dict(self.custom_hyperparams or {}), self.trial_id
         self.custom_hyperparams, self.trial_id = None, None
         with redirect_stdout(StringIO()):  # it prints what is not all of it
-            hyperparams, _ = super().read_hyperparameters()
+            try:
+                hyperparams, _ = super().read_hyperparameters()
+            except (AttributeError, TypeError):
+                raise ValueError(
+                    f"{self.config} is no file of hyperparameters: expected ids of envs, with settings."
+                ) from None
         in_file = hyperparams.pop("method", DEFAULT)
         in_params = given.pop("method", in_file)
         self.method = get_method(self._method_name or in_params)
@@ -85,6 +92,8 @@ class MetaExperimentManager(ExperimentManager):
         if self.optimize_hyperparameters and not isinstance(self.method, PEARLMethod):
             raise ValueError(f"The search is for settings of PEARL, and {self.method.name} has none: choose another --method.")
         hyperparams = self.method.settings(plain_settings(hyperparams, self.config, self.trust))
+        if self.resumed is not None:  # what a user gave comes from a file now
+            given = plain_settings(given, self.resumed / RECORD, self.trust)
         hyperparams = merged(merged(hyperparams, self._trial(trial_id)), given)
         saved = OrderedDict(sorted(hyperparams.items()))
         print(f"Method {self.method.name}: {self.config} has the settings of the env. With those of the command line:")
@@ -148,6 +157,17 @@ class MetaExperimentManager(ExperimentManager):
         )
         return env if self.vec_env_wrapper is None else self.vec_env_wrapper(env)
 
+    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
+        """
+        :return: the model and its hyperparameters; None for a search
+        """
+        try:
+            return super().setup_experiment()
+        except BaseException:
+            if self._claimed is not None:  # nothing was trained in it
+                shutil.rmtree(self._claimed)
+            raise
+
     def create_log_folder(self) -> None:
         """Make the run's folder, or take the one of the run that goes on; a search has none."""
         self.log_path = f"{self.log_folder}/{self.method.name}/"
@@ -158,8 +178,9 @@ class MetaExperimentManager(ExperimentManager):
         if self.resumed is None:
             # An env that cannot be trained on should say so before there is a folder
             make_task_vec_env(self.env_name.gym_id, env_kwargs=self.env_kwargs, wrapper=self.env_wrapper).close()
-            self.save_path = str(claim(self.log_path, self.env_name, self._unique))
-            self._lock = lock(Path(self.save_path))
+            self._claimed = claim(self.log_path, self.env_name, self._unique)
+            self.save_path = str(self._claimed)
+            self._lock = lock(self._claimed)
         else:
             self.save_path = str(self.resumed)
             self._lock = lock(self.resumed)
@@ -215,9 +236,11 @@ class MetaExperimentManager(ExperimentManager):
         try:
             super().save_trained_model(model)
         except WRITE_ERRORS as error:
+            again = f"`sb3-htr train --resume {self.save_path}` goes on from the last checkpoint"
+            if not checkpoints(Path(self.save_path)):
+                again = "train again, as there is no checkpoint either"
             raise OSError(
-                f"The last model could not be written to {self.save_path} ({reason(error)}): free some space, and "
-                f"`sb3-htr train --resume {self.save_path}` goes on from the last checkpoint."
+                f"The last model could not be written to {self.save_path} ({reason(error)}): mend that, and {again}."
             ) from error
 
     def objective(self, trial: optuna.Trial) -> float:
@@ -321,7 +344,7 @@ def run_rl_zoo(
             "CheckpointCallback": CheckpointCallback,
             "ProgressBarCallback": MetaProgressBarCallback,
         },
-        rl_zoo3.train: {"ExperimentManager": manager},
+        rl_zoo3.train: {"ExperimentManager": manager, "ALGOS": {algorithm.name: algorithm.model_class()}},
     }
     for module, classes in replaced.items():
         vars(module).update(classes)

@@ -46,12 +46,12 @@ class Method:
         """
         return of_env
 
-    def explorers(self, names: tuple[str, ...]) -> tuple[str, ...]:
+    def explorer_for(self, name: str) -> str:
         """
-        :param names: of explorers that agents are to be evaluated with
+        :param name: of an explorer that agents are to be evaluated with
         :return: the same, or how an agent without explorers explores
         """
-        return (OWN,)
+        return OWN
 
 
 @dataclass(frozen=True)
@@ -101,8 +101,8 @@ class PEARLMethod(Method):
         """
         return keywords_of(RELABELLERS[self.relabeller])
 
-    def explorers(self, names: tuple[str, ...]) -> tuple[str, ...]:
-        return names
+    def explorer_for(self, name: str) -> str:
+        return name
 
     def under_prior(self) -> "PEARLMethod":
         """

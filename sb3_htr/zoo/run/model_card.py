@@ -7,8 +7,8 @@ import yaml
 from huggingface_hub import EvalResult, ModelCardData
 
 from sb3_htr.adaptation.evaluation import AdaptationRecord
-from sb3_htr.zoo.run.agents import file_stem
 from sb3_htr.zoo.run.algorithm import Algorithm
+from sb3_htr.zoo.run.hub import model_name
 from sb3_htr.zoo.run.method import DEFAULT, get_method, methods
 
 TAGS = (
@@ -81,7 +81,7 @@ def snippet(algorithm: Algorithm, path: str, env: str, n_episodes: int) -> str:
 
 model = {name}.load({path})
 env = {env}
-agent = model.adapt(env, n_episodes={n_episodes}, task=env.unwrapped.test_tasks[0])
+agent = model.adapt(env, n_episodes={n_episodes}, task=env.get_wrapper_attr("test_tasks")[0])
 print(agent.returns)  # of the adaptation episodes; agent.predict(observation) acts on this task
 """
     return f"""from sb3_htr import evaluate_adaptation
@@ -89,7 +89,7 @@ from {algorithm.module} import {name}
 
 model = {name}.load({path})
 env = {env}
-returns, successes = evaluate_adaptation(model, env, env.unwrapped.test_tasks[:1], n_episodes={n_episodes})
+returns, successes = evaluate_adaptation(model, env, env.get_wrapper_attr("test_tasks")[:1], n_episodes={n_episodes})
 print(returns)  # of the episodes
 """
 
@@ -121,15 +121,22 @@ def model_card(record: dict[str, Any], scores: dict[str, AdaptationRecord], repo
     imports = "".join(f"import {package}  # registers the env\n" for package in record["gym_packages"] or ["htr_envs"])
     if env_id.startswith("HiddenGoal/") and not record["gym_packages"]:
         imports += f'htr_envs.hide_goal("{env_id.partition("/")[2]}")  # registers the family\n'
-    file = f"{file_stem(env_id)}.zip"
-    path = f'"{file}"'
-    if repo_id is not None:
-        imports += "from huggingface_hub import hf_hub_download\n"
-        path = f'hf_hub_download("{repo_id}", {path})'
     # A method of another version says no more than its name
     method = methods().get(name)
     about = PEARL if method is None else method.about
     algorithm = (method or get_method(DEFAULT)).algorithm
+    model = model_name(env_id, algorithm.name)
+    file = f"{model}.zip"
+    watch = f"sb3-htr enjoy {file}"
+    path = f'"{file}"'
+    if repo_id is not None:
+        imports += "from huggingface_hub import hf_hub_download\n"
+        path = f'hf_hub_download("{repo_id}", {path})'
+        user, _, repo_name = repo_id.partition("/")
+        named = ("" if model == model_name(env_id) else f" --algo {algorithm.name}") + (
+            "" if repo_name == model else f" -name {repo_name}"
+        )
+        watch = f"sb3-htr load_from_hub --env {env_id} -orga {user}{named}\n$ sb3-htr enjoy --env {env_id}"
     use = snippet(algorithm, path, f'gymnasium.make("{env_id}"{kwargs})', min(n_episodes, 10))
     of_explorers = OF_EXPLORERS if algorithm.also_explores_by else ""
     versions = ", ".join(f"{package} {version}" for package, version in record.get("versions", {}).items())
@@ -152,7 +159,7 @@ has not seen, with mean actions.{of_explorers}
 
 ```console
 $ pip install 'sb3_htr[zoo,video]'
-$ sb3-htr enjoy {file}
+$ {watch}
 ```
 
 ```python
