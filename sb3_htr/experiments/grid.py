@@ -171,6 +171,20 @@ ALL = (
         60_000,
         tuple(map(Variant, ("htr-ser", "htr-ec", "pearl-dense", "pearl-sparse"))),
     ),
+    # RL2 learns slowly; SAC and HER are told the task, and learn fast
+    Experiment(
+        "rivals",
+        "HTR against other ways to relabel and to adapt, and against agents that are told more.",
+        POINT,
+        150_000,
+        (
+            *map(Variant, ("htr-ser", "htr-hfr", "htr-hipi")),
+            Variant("rl2", budget=10),
+            Variant("sac-her", budget=2 / 15),
+            Variant("pearl-dense", budget=3),
+        ),
+        evaluations=by(("belief", "prior")),
+    ),
     # HTR paper, figure 11. Steps of an episode for each distance: time to get there, and as long again. The budget is that of
     # episodes of 20 steps; longer ones have as many episodes and updates
     Experiment(

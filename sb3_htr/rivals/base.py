@@ -106,8 +106,8 @@ class Rival(AtomicSave, BaseAlgorithm):
 
     #: Policy of a file that does not say its own
     DEFAULT_POLICY: ClassVar[str]
-    #: Settings that an agent which is loaded to act has of its training, and those that it has in their place
-    ACTS_BY: ClassVar[tuple[str, ...]] = ("policy_kwargs",)
+    #: Settings, whole numbers, that an agent which is loaded to act has of its training, and those that it has in their place
+    ACTS_BY: ClassVar[tuple[str, ...]] = ()
     ACTS_WITH: ClassVar[dict[str, Any]] = {}
     explorer = OwnWay()
     #: Of a training that goes on: takes effect once learn() has set everything up, which draws random numbers

@@ -91,7 +91,7 @@ class RL2(Rival, RecurrentPPO):
     """
 
     DEFAULT_POLICY: ClassVar[str] = "MlpLstmPolicy"
-    ACTS_BY: ClassVar[tuple[str, ...]] = ("policy_kwargs", "n_episodes_per_trial")
+    ACTS_BY: ClassVar[tuple[str, ...]] = ("n_episodes_per_trial",)
     policy: RecurrentActorCriticPolicy
     env: TrialVecEnv | None
 

@@ -108,10 +108,20 @@ def test_a_method_of_another_algorithm_cannot_stand_in_a_yaml_file(tmp_path: Pat
 
 def test_a_file_that_does_not_fit_its_record_is_refused(runs: Path) -> None:
     agent = agent_at(runs / "sac-her")
-    for wrong in ({"net_arch": [5]}, {"net_arch": "[5]"}, {"features_extractor_class": "os.system"}, {"width": 3}):
+    wrongs: list[Any] = [
+        {"net_arch": [5]},
+        {"net_arch": "[5]"},
+        {"net_arch": [10**9]},
+        {"features_extractor_class": "os.system"},
+    ]
+    for wrong in [*wrongs, {"net_arch": [2**14] * 16}, [3], {"lstm_hidden_size": 4}]:
         record: dict[str, Any] = {**agent.record, "hyperparams": {"policy_kwargs": wrong}}
-        with pytest.raises(ValueError, match="is damaged, or no sac-her model with the settings of its record"):
+        with pytest.raises(ValueError, match=r"best_model.zip is damaged, or no SACHER with the settings"):
             TrainedAgent(agent.path, record, None).load()
+    agent = agent_at(runs / "rl2")
+    record = {**agent.record, "hyperparams": {**agent.record["hyperparams"], "n_episodes_per_trial": 10**9}}
+    with pytest.raises(ValueError, match="RL2 with the settings of its record: it has 6400 env steps"):
+        TrainedAgent(agent.path, record, None).load()
 
 
 @pytest.mark.parametrize("file", ["rl2.yml", "sac_her.yml"])

@@ -1,23 +1,19 @@
 """What the zoo has to know of an algorithm: where it is, what its settings are, and how a model of it is loaded."""
 
 import importlib
-import json
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import gymnasium as gym
-from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_htr.pearl import PEARL, load_untrusted
 from sb3_htr.rivals.base import Rival
+from sb3_htr.rivals.untrusted import load_untrusted as load_untrusted_rival
 from sb3_htr.zoo.run.shipped import hyperparams_file
 
 # What a run trains and a command adapts
 Model = PEARL | Rival
-# What a file of weights may unpack to
-MAX_BYTES = 2**30
 
 
 @dataclass(frozen=True)
@@ -66,21 +62,7 @@ class Algorithm:
             return model_class.load(path, device=device)
         if model_class is PEARL:
             return load_untrusted(path, env, device)
-        # A new model with the plain settings of the record, and the weights of the file
-        given = record.get("hyperparams", {})
-        settings = {name: given[name] for name in model_class.ACTS_BY if name in given} | model_class.ACTS_WITH
-        try:
-            with zipfile.ZipFile(path) as archive:
-                if sum(info.file_size for info in archive.infolist()) > MAX_BYTES:
-                    raise ValueError(f"it unpacks to more than {MAX_BYTES} bytes")
-                n_steps = json.loads(archive.read("data")).get("num_timesteps", 0)
-            model: Rival = model_class(given.get("policy", model_class.DEFAULT_POLICY), env, device=device, **settings)
-            _, weights, _ = load_from_zip_file(path, load_data=False, device=model.device)
-            model.policy.load_state_dict(cast(Any, weights["policy"]))
-        except (KeyError, TypeError, AssertionError, AttributeError, RuntimeError, ValueError, zipfile.BadZipFile) as error:
-            raise ValueError(f"{path} is damaged, or no {self.name} model with the settings of its record: {error}") from None
-        model.num_timesteps = n_steps if type(n_steps) is int else 0
-        return model
+        return load_untrusted_rival(model_class, path, record.get("hyperparams", {}), env, device)
 
 
 ALGORITHMS = {

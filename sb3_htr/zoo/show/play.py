@@ -186,4 +186,4 @@ def heading(tasks: np.ndarray, which: str, number: int) -> str:
     :return: what there is to say about the task
     """
     vector = ", ".join(f"{value:.2f}" for value in tasks[number - 1])
-    return f"{which} task {number} of {len(tasks)}, which the agent is not told: ({vector})"
+    return f"{which} task {number} of {len(tasks)}: ({vector})"

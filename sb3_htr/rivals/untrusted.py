@@ -1,0 +1,71 @@
+"""Rivals of unknown origin."""
+
+import copy
+import io
+import json
+import zipfile
+from pathlib import Path
+from typing import Any, TypeVar
+
+import gymnasium as gym
+
+from sb3_htr.common.plain import MAX_BYTES, load_plain
+from sb3_htr.rivals.base import Rival
+
+SelfRival = TypeVar("SelfRival", bound=Rival)
+# How large networks may be: below a gigabyte
+MAX_LAYERS, MAX_UNITS = 4, 1024
+# What a file may say of networks, with the largest number for each
+NETWORKS = {"net_arch": MAX_UNITS, "lstm_hidden_size": MAX_UNITS, "n_lstm_layers": MAX_LAYERS}
+NETWORKS |= dict.fromkeys(("shared_lstm", "enable_critic_lstm", "use_sde"), 1)
+# The largest number of what else it may say
+MAX_COUNT = 10_000
+
+
+def load_untrusted(
+    model_class: type[SelfRival], path: Path, hyperparams: dict[str, Any], env: gym.Env, device: str
+) -> SelfRival:
+    """
+    Load weights and plain settings without running code of the file, and in no more memory than agents of this kind need.
+
+    :param model_class: of the model
+    :param path: file of ``save``
+    :param hyperparams: of its training
+    :param env: env of the same spaces
+    :param device: torch device
+    :return: a model to adapt and evaluate with
+    :raises ValueError: if it is no such file, or its weights do not fit the settings
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(info.file_size for info in archive.infolist()) > MAX_BYTES:
+                raise ValueError(f"it unpacks to more than {MAX_BYTES} bytes")
+            n_steps = json.loads(archive.read("data"))["num_timesteps"]
+            weights = load_plain(io.BytesIO(archive.read("policy.pth")))
+        # A copy, because SB3 adds to it
+        policy_kwargs = copy.deepcopy(hyperparams.get("policy_kwargs", {}))
+        counts = {name: hyperparams[name] for name in model_class.ACTS_BY if name in hyperparams}
+        if type(n_steps) is not int or not all(_is_plain(count, MAX_COUNT) for count in counts.values()):
+            raise ValueError(f"it has {n_steps} env steps and the settings {counts}")
+        for name, value in policy_kwargs.items():
+            parts = value.values() if isinstance(value, dict) else [value]
+            if name not in NETWORKS or not all(_is_plain(part, NETWORKS[name]) for part in parts):
+                raise ValueError(
+                    f"its policy has {name}: {value}, which only --trust restores, and that may run code of the file"
+                )
+        model = model_class(
+            model_class.DEFAULT_POLICY, env, device=device, policy_kwargs=policy_kwargs, **model_class.ACTS_WITH
+        )
+        model.policy.load_state_dict(weights)
+    except Exception as error:  # whatever a stranger can put into a file
+        why = str(error).splitlines()[-1].strip()[:200] if isinstance(error, ValueError | RuntimeError) and str(error) else ""
+        raise ValueError(f"{path} is damaged, or no {model_class.__name__} with the settings of its record: {why}") from None
+    for name, value in {**counts, "num_timesteps": n_steps}.items():
+        setattr(model, name, value)
+    return model
+
+
+def _is_plain(value: Any, largest: int) -> bool:
+    """Whether it is a number up to the largest, or a few of them."""
+    numbers = value if isinstance(value, list) else [value]
+    return len(numbers) <= MAX_LAYERS and all(type(n) in (int, bool) and n <= largest for n in numbers)
