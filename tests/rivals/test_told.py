@@ -10,8 +10,9 @@ from helpers import ENV_ID
 from htr_envs import PointRobotFamily
 from sb3_htr import evaluate_adaptation
 from sb3_htr.common.vec_env import make_task_vec_env
-from sb3_htr.rivals.sac_her import SACHER, ShownTaskVecEnv, TaskHerReplayBuffer
+from sb3_htr.rivals.sac_her import SACHER, TaskHerReplayBuffer
 from sb3_htr.rivals.scripted import ScriptedAgent
+from sb3_htr.rivals.shown_task import ShownTaskVecEnv
 
 N_STEPS = 20
 
