@@ -8,7 +8,7 @@ import pytest
 from sb3_htr.adaptation import Aggregate, Belief, Explorer, Prior
 from sb3_htr.adaptation.explorers import EXPLORERS, to_explorer
 from sb3_htr.common.settings import make
-from sb3_htr.htr import EpisodeClustering, Relabeller, SingleEpisodeRelabelling
+from sb3_htr.htr import EpisodeClustering, HindsightForesight, HindsightInference, Relabeller, SingleEpisodeRelabelling
 from sb3_htr.htr.relabel import RELABELLERS
 
 Kinds = Mapping[str, Callable[..., Any]]
@@ -57,4 +57,4 @@ def test_a_setting_that_cannot_be_is_named(kinds: Kinds, base: Any, settings: di
 def test_the_names_of_files_and_records_are_those_of_the_classes() -> None:
     assert {name: explorer().name for name, explorer in EXPLORERS.items()} == {name: name for name in EXPLORERS}
     assert {name: kind.__name__ for name, kind in RELABELLERS.items()} == {name: name for name in RELABELLERS}
-    assert set(RELABELLERS.values()) == {SingleEpisodeRelabelling, EpisodeClustering}
+    assert set(RELABELLERS.values()) == {SingleEpisodeRelabelling, EpisodeClustering, HindsightForesight, HindsightInference}
