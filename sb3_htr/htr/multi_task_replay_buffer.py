@@ -12,7 +12,7 @@ from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from sb3_htr.common.checks import check_numbers, check_same_family, family_facts
 from sb3_htr.common.random_state import get_generator_state, set_generator_state
 from sb3_htr.common.settings import make
-from sb3_htr.common.task_reward import task_reward
+from sb3_htr.common.task_reward import ROUNDING, task_reward
 from sb3_htr.common.type_aliases import Context, MultiTaskSamples, RewardLabels, TaskFamily
 from sb3_htr.htr.episode_store import EpisodeStore
 from sb3_htr.htr.relabel import RELABELLERS, Relabeller
@@ -225,7 +225,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
     def check_reward_hook(self, episodes: Sequence[tuple[int, np.ndarray]]) -> None:
         """
         :param episodes: training tasks and transitions (length, width) of some episodes
-        :raises ValueError: if the reward hook disagrees with what the env gave for them
+        :raises ValueError: if the reward hook disagrees with what the env gave for them, or a success is worth nothing
         """
         rows = np.concatenate([episode for _, episode in episodes])
         task = np.repeat([task for task, _ in episodes], [len(episode) for _, episode in episodes])
@@ -238,6 +238,17 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             raise ValueError(
                 f"The env gave {given[i]:g} for a step of task {task[i]}, but its compute_reward gives {computed[i]:g}: "
                 "relabelled rewards would be of another task family. Run htr_envs.check_task_env(env) to find out why."
+            )
+        ends = np.cumsum([len(episode) for _, episode in episodes]) - 1
+        last = self.transitions.trajectory(rows[ends, None])
+        reward = self.task_family.compute_reward(last, self.task_family.hindsight_task(last, 0))
+        worthless = task_reward(reward, last.task_free_reward)[:, 0] <= 0
+        if worthless.any():
+            i = int(worthless.argmax())
+            raise ValueError(
+                f"A step is worth {reward[i, 0]:g} under the task that it solves, and its task-free reward is "
+                f"{last.task_free_reward[i, 0]:g}, so that nothing tells the success: info['task_free_reward'] must be what a "
+                "step returns that solves nothing, which is -1 where rewards are -1 and 0."
             )
 
     def discard_open_episodes(self) -> None:
@@ -325,7 +336,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         labels = self._label(rows[len(context) :], rows[: len(context)], n_context, reward_task, n_labelled)
         data = self.to_torch(rows, copy=False)
         context_rows, rl_rows = data[: len(context)], data[len(context) :]
-        unrewarded = rows[len(context) :, columns.reward] == rows[len(context) :, columns.task_free_reward]
+        beside = rows[len(context) :, columns.reward] - rows[len(context) :, columns.task_free_reward]
         return MultiTaskSamples(
             context=Context(
                 observations=context_rows[:, columns.observation],
@@ -341,7 +352,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             lengths=self.to_torch(n_batch, copy=False),
             task_ids=tasks,
             relabelled=relabelled,
-            unrewarded=np.logical_and.reduceat(unrewarded, np.cumsum(n_batch) - n_batch),
+            unrewarded=np.logical_and.reduceat(np.abs(beside) <= ROUNDING, np.cumsum(n_batch) - n_batch),
             labels=labels,
         )
 
@@ -355,7 +366,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         chosen = self._rng.permutation(len(rows))[:n_labelled]
         traj = columns.trajectory(rows[chosen])
         reward = task_reward(self.task_family.compute_reward(traj, tasks), traj.task_free_reward)
-        rewarded = context[:, columns.reward] != context[:, columns.task_free_reward]
+        rewarded = task_reward(context[:, columns.reward], context[:, columns.task_free_reward]) > 0
         inferred = np.logical_or.reduceat(rewarded, np.cumsum(n_context) - n_context)
         labels = (chosen, reward.T > 0, reward.T, traj.task_free_reward, inferred)
         dtypes = (np.int64, *[np.float32] * 4)

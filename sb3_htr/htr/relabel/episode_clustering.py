@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import torch as th
 
+from sb3_htr.common.task_reward import ROUNDING
 from sb3_htr.common.type_aliases import Trajectory
 from sb3_htr.htr.episode_store import EpisodeStore
 from sb3_htr.htr.relabel.base import HindsightDraw, Relabeller
@@ -117,7 +118,7 @@ class EpisodeClustering(Relabeller):
         if len(index.rows) == 0:
             return 0.0
         rows = episodes.rows[index.rows]
-        task_part = np.abs(rows[:, columns.reward] - rows[:, columns.task_free_reward]) > 0
+        task_part = np.abs(rows[:, columns.reward] - rows[:, columns.task_free_reward]) > ROUNDING
         return float((np.add.reduceat(task_part, index.episode_row[:-1]) > 0).mean())
 
     def stats(self) -> dict[str, float]:
