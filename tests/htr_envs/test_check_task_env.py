@@ -9,7 +9,7 @@ from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 
 from helpers.broken_envs import BROKEN, LineEnv, LineFamily, column
-from htr_envs import check_task_env
+from htr_envs import MetaEnv, TaskDistribution, check_task_env
 
 # Annotations here are wide on purpose: most of these classes break the types that they should have.
 
@@ -57,8 +57,86 @@ def test_a_family_without(name: str) -> None:
 @pytest.mark.parametrize("name", ["observation_space", "action_space"])
 def test_spaces_of_another_type(name: str) -> None:
     env = LineEnv()
-    setattr(env, name, spaces.Box(-1.0, 1.0, (1,), np.float64))
-    assert_refused(env, f"The {name} must be a one-dimensional float32 Box")
+    setattr(env, name, spaces.Box(-1, 1, (1,), np.int64))
+    assert_refused(env, f"The {name} must be a one-dimensional Box of floats")
+
+
+def test_spaces_of_float64_are_fine() -> None:
+    class Double(LineEnv):
+        def __init__(self) -> None:
+            super().__init__()
+            self.observation_space = spaces.Box(-5.0, 5.0, (2,), np.float64)
+            self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float64)
+
+        def observe(self) -> Any:
+            return super().observe().astype(np.float64) / 3
+
+    env = Double()
+    assert env.reset()[0].dtype == env.step(env.action_space.sample())[0].dtype == np.float64
+    check_task_env(env)
+
+
+# ---------------------------------------------------------------- tasks that may change anything
+
+
+class HeavyDistribution(TaskDistribution):
+    """How heavy a cart is."""
+
+    def __init__(self) -> None:
+        super().__init__(spaces.Box(0.5, 4.0, (1,), np.float32), [[1.0], [2.0]], [[1.5]], [[3.0]])
+
+    def sample_tasks(self, n: int, rng: np.random.Generator) -> Any:
+        return rng.uniform(0.5, 4.0, (n, 1)).astype(np.float32)
+
+
+class CartEnv(MetaEnv):
+    """Pushed along a line; it ends where a heavy cart has gone less far."""
+
+    def __init__(self) -> None:
+        super().__init__(HeavyDistribution())
+        self.observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float64)
+        self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.max_episode_steps = 10
+        self.x, self.noise = 0.0, np.random.default_rng(0)
+
+    def first(self) -> float:
+        return float(self.np_random.normal())
+
+    def _reset_state(self) -> Any:
+        self.x = self.first()
+        return [self.x]
+
+    def push(self, action: Any) -> float:
+        return float(action[0] / self.task[0])
+
+    def _step_state(self, action: Any) -> Any:
+        self.x += self.push(action)
+        return [self.x], self.x, abs(self.x) > 2
+
+
+def test_an_env_whose_tasks_change_anything() -> None:
+    check_task_env(TimeLimit(CartEnv(), 10))
+
+
+class TellsItsTask(CartEnv):
+    def first(self) -> float:
+        return float(self.task[0])
+
+
+class Noisy(CartEnv):
+    def push(self, action: Any) -> float:
+        return super().push(action) + float(self.noise.normal())
+
+
+@pytest.mark.parametrize(
+    ("env_class", "sentence"),
+    [
+        (TellsItsTask, "The task leaks into the first observation"),
+        (Noisy, "The same seed, task and actions gave another episode"),
+    ],
+)
+def test_an_env_whose_tasks_change_what_they_must_not(env_class: type[CartEnv], sentence: str) -> None:
+    assert_refused(env_class(), sentence)
 
 
 @pytest.mark.parametrize(
