@@ -203,10 +203,10 @@ class MetaEnv(gym.Env[FloatArray, FloatArray], ABC):
         # drawn even if it is not used: a seed then gives the same starts whichever way the task was chosen
         drawn = int(self.np_random.integers(len(self.train_tasks)))
         self._current = (drawn, self.train_tasks[drawn]) if self._given is None else self._given
-        return self._observe(self._reset_state()), {"task_id": self.task_id}
+        return self._remember_observation(self._reset_state()), {"task_id": self.task_id}
 
-    def _observe(self, state: ArrayLike) -> FloatArray:
-        observation = np.array(state, dtype=self.observation_space.dtype)
+    def _remember_observation(self, state: ArrayLike) -> FloatArray:
+        observation: FloatArray = np.array(state, dtype=self.observation_space.dtype)
         self._observation = observation.astype(np.float32)
         return observation
 
@@ -218,10 +218,10 @@ class MetaEnv(gym.Env[FloatArray, FloatArray], ABC):
         :raises ValueError: if the action has the wrong shape.
         :raises gymnasium.error.ResetNeeded: before the first reset.
         """
-        _, observation, reward, terminated = self._move(action)
+        _, observation, reward, terminated = self._checked_step(action)
         return observation, float(reward), bool(terminated), False, {"task_id": self.task_id}
 
-    def _move(self, action: FloatArray) -> tuple[FloatArray, FloatArray, float, bool]:
+    def _checked_step(self, action: FloatArray) -> tuple[FloatArray, FloatArray, float, bool]:
         """Check the action and move the dynamics.
 
         :param action: what the agent gave.
@@ -233,7 +233,7 @@ class MetaEnv(gym.Env[FloatArray, FloatArray], ABC):
         if action.shape != self.action_space.shape:
             raise ValueError(f"The action has shape {action.shape}, expected {self.action_space.shape}: pass one action.")
         state, reward, terminated = self._step_state(action)
-        return action, self._observe(state), reward, terminated
+        return action, self._remember_observation(state), reward, terminated
 
     def _current_task(self) -> tuple[int, FloatArray]:
         if self._current is None:

@@ -196,7 +196,7 @@ class TaskEnv(MetaEnv):
         :raises gymnasium.error.ResetNeeded: before the first reset.
         """
         before = self._observation
-        action, observation, task_free_reward, terminated = self._move(action)
+        action, observation, task_free_reward, terminated = self._checked_step(action)
         after = self._observation
         assert before is not None and after is not None
         # one reward function for step and for relabelling: compute_reward gives step's rewards again, bit for bit

@@ -43,6 +43,8 @@ class LineFamily(TaskFamily):
 class LineEnv(TaskEnv):
     """A walker on a line that pays for its effort; its episodes end after ten steps."""
 
+    max_episode_steps = 10
+
     def __init__(self, family: TaskFamily | None = None) -> None:
         super().__init__(LineFamily() if family is None else family)
         self.observation_space = spaces.Box(-5.0, 5.0, (2,), np.float32)

@@ -69,7 +69,7 @@ def adapt(agent: TrainedAgent, args: argparse.Namespace) -> Adapted:
     known_z = particles.z[particles.is_train].numpy()
     radius = getattr(family, "goal_radius", None)
     explorer = adaptation.explorer.name
-    start = start_position(agent.make_env()) if tasks.shape[1] == 2 else None
+    start = start_position(agent.make_env()) if record.achieved.shape[-1] == 2 else None
     return Adapted(tasks, radius, start, explorer, record, *adaptation.posterior(), ~adaptation.explorer.exploring(), known_z)
 
 
