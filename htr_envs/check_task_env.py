@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory
 
-MAX_STEPS = 200  # for an env without a time limit
+MAX_STEPS = 200  # of an episode that are looked at
 N_DRAWS = 30
 TASK_SETS = ("train_tasks", "validation_tasks", "test_tasks")
 # What tells the reward of a step under any task; a family of a MetaEnv has none of these
@@ -71,6 +71,9 @@ def _check_interface(env: gym.Env[Any, Any]) -> TaskFamily:
     for what, space in (("observation_space", env.observation_space), ("action_space", env.action_space)):
         flat = isinstance(space, spaces.Box) and len(space.shape) == 1 and np.issubdtype(space.dtype, np.floating)
         _require(flat, f"The {what} must be a one-dimensional Box of floats.")
+    limited = any(env.has_wrapper_attr(name) for name in ("_max_episode_steps", "max_episode_steps"))
+    limited = limited or (env.spec is not None and env.spec.max_episode_steps is not None)
+    _require(limited, "The env has no time limit: register it with max_episode_steps, and pass gymnasium.make(id).")
     return family
 
 

@@ -3,6 +3,8 @@
 import os
 import sys
 
+from gymnasium.error import DependencyNotInstalled
+
 
 def has_screen() -> bool:
     """Whether a window would be seen.
@@ -13,6 +15,11 @@ def has_screen() -> bool:
 
 
 def open_no_window() -> None:
-    """Have MuJoCo draw without a window where there is no screen; gymnasium would try to open one, which ends the process."""
-    if not has_screen():
-        os.environ.setdefault("MUJOCO_GL", "egl")
+    """Have MuJoCo draw without a window where there is no screen; gymnasium would try to open one, which ends the process.
+
+    :raises DependencyNotInstalled: if a window is asked for.
+    """
+    if not has_screen() and os.environ.setdefault("MUJOCO_GL", "egl") == "glfw":
+        raise DependencyNotInstalled(
+            "MUJOCO_GL is glfw, which needs a screen, and there is none: set MUJOCO_GL=egl, or osmesa without a GPU."
+        )

@@ -2,10 +2,19 @@
 
 from pathlib import Path
 
+from sb3_htr.adaptation.agent import AdaptedAgent
 from sb3_htr.adaptation.evaluation import evaluate_adaptation
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr import MultiTaskReplayBuffer
 from sb3_htr.pearl import PEARL, load_untrusted
 
 __version__ = (Path(__file__).parent / "version.txt").read_text().strip()
-__all__ = ["PEARL", "MultiTaskReplayBuffer", "__version__", "evaluate_adaptation", "load_untrusted", "make_task_vec_env"]
+__all__ = [
+    "PEARL",
+    "AdaptedAgent",
+    "MultiTaskReplayBuffer",
+    "__version__",
+    "evaluate_adaptation",
+    "load_untrusted",
+    "make_task_vec_env",
+]

@@ -8,9 +8,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.error import DependencyNotInstalled
 from hypothesis import given
 from hypothesis import strategies as st
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL, many
 from htr_envs import PointRobotEnv, PointRobotVectorEnv
@@ -51,6 +52,10 @@ class WithoutHook(gym.Wrapper[Any, Any, Any, Any]):
         (lambda: WithSpaces(gym.make(ENV_ID), action_space=spaces.Discrete(3)), "The action space is Discrete"),
         (lambda: gym.make(ENV_ID, reward_type="dense"), "reward_type is not 'sparse'.*rl_reward_type"),
         (lambda: PointRobotEnv(), "The env has no time limit"),
+        (
+            lambda: gym.make_vec(ENV_ID, 2),
+            "is a gymnasium VectorEnv, expected one of Stable-Baselines3: pass the env's id",
+        ),
         (lambda: VecNormalize(make_task_vec_env(ENV_ID, 2)), "VecNormalize stands between .*normalize_observations"),
         (lambda: DummyVecEnv([lambda: gym.make("Pendulum-v1")]), "no task_family"),
     ],
@@ -76,6 +81,7 @@ def test_an_unknown_id_is_gymnasiums_business(tiny_pearl: MakePEARL) -> None:
         ({"kl_coef": -0.1}, "kl_coef is -0.1, expected a number of at least 0"),
         ({"gamma": 1.1}, "gamma is 1.1, expected a number from 0 to 1"),
         ({"tau": float("nan")}, "tau is nan"),
+        ({"tau": 0.0}, "tau is 0, with which the target critics would never learn"),
         ({"gradient_steps": 0}, "gradient_steps is 0"),
         ({"learning_starts": -1}, "learning_starts is -1"),
         ({"explorer": {"name": "prior", "n_exploration_episodes": -1}}, "n_exploration_episodes is -1"),
@@ -127,6 +133,10 @@ def another_task(n_steps: int, values: list[Any]) -> None:
     values[4] = {**values[4], "task_id": n_steps % 7}
 
 
+def failing(n_steps: int, values: list[Any]) -> None:
+    np.zeros(3) + np.zeros(2)
+
+
 def no_training_task(n_steps: int, values: list[Any]) -> None:
     values[4] = {**values[4], "task_id": -1}
 
@@ -139,6 +149,7 @@ def no_training_task(n_steps: int, values: list[Any]) -> None:
         (put(0, np.full(2, np.nan, dtype=np.float32)), r"The next_observation of task .* is \[nan nan\], expected finite"),
         (put(1, 0.5), r"The env gave 0.5 for a step of task \d+, but its compute_reward gives 0: .*check_task_env"),
         (put(0, np.zeros(3, dtype=np.float32)), r"An env failed at env step \d+, on one of .* tasks \[\d+\].*the shape of"),
+        (failing, r"An env failed at env step \d+, on one .* \(operands could not be broadcast .* \)\.$"),
         (put(3, False), r"An episode is longer than the env's time limit of 20 steps"),
         (another_task, r"The task of env 0 changed from \d to \d within an episode"),
         (no_training_task, r"info\['task_id'\] is -1, expected a training task"),
@@ -155,6 +166,88 @@ def test_episodes_of_one_step_are_episodes(tiny_pearl: MakePEARL) -> None:
     env = Changed(gym.make(ENV_ID), put(2, True))
     model = tiny_pearl(env, n_tasks_per_rollout=1, n_episodes_per_task=50).learn(200)
     assert model.replay_buffer is not None and model.replay_buffer.n_episodes.sum() == 200
+
+
+class Rewarded(gym.RewardWrapper[Any, Any]):
+    def reward(self, reward: Any) -> float:
+        return 2.0 * float(reward)
+
+
+class Paid(gym.Wrapper[Any, Any, Any, Any]):
+    """No kind of wrapper that is known to change rewards, and it changes those of successes alone."""
+
+    def step(self, action: Any) -> Any:
+        obs, reward, *others = self.env.step(action)
+        return obs, 2.0 * float(reward), *others
+
+
+def wrapped(wrapper: Any, **kwargs: Any) -> DummyVecEnv:
+    return DummyVecEnv([lambda: wrapper(gym.make(ENV_ID, **kwargs))] * 4)
+
+
+# Goals that a random agent comes across
+NEAR = {"goal_distance": 0.3}
+CHANGED = [
+    (lambda: wrapped(Rewarded, **NEAR), "in gymnasium's RewardWrapper, which changes its rewards"),
+    (lambda: wrapped(Paid, **NEAR), "The env gave .* but its compute_reward gives"),
+    (lambda: make_task_vec_env(ENV_ID, 4, env_kwargs={**NEAR, "reward_type": "dense"}), "reward_type is not 'sparse'"),
+    (lambda: make_task_vec_env(ENV_ID, 4, env_kwargs={"goal_distance": 0.5}), "another task family: its goal_distance is 0.5"),
+    (lambda: VecMonitor(VecNormalize(make_task_vec_env(ENV_ID, 4, env_kwargs=NEAR))), "VecNormalize stands between"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), CHANGED)
+@pytest.mark.parametrize("how", ["set_env", "load and replay", "load"])
+def test_wrong_rewards_are_refused_whenever_they_come_in(
+    how: str, change: Callable[[], Any], message: str, tiny_pearl: MakePEARL, tmp_path: Path
+) -> None:
+    model = tiny_pearl(make_task_vec_env(ENV_ID, 4, env_kwargs=NEAR)).learn(ROLLOUT)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    if how == "load" and "family" in message:
+        # Nothing was collected, and so another family is a new beginning
+        loaded = PEARL.load(tmp_path / "model", env=change())
+        assert loaded.replay_buffer is not None and vars(loaded.replay_buffer.task_family)["goal_distance"] == 0.5
+        return
+    with pytest.raises(ValueError, match=message):
+        if how == "set_env":
+            model.set_env(change())
+        else:
+            model = PEARL.load(tmp_path / "model", env=change())
+            if how == "load and replay":
+                model.load_replay_buffer(tmp_path / "buffer")
+        model.learn(10 * ROLLOUT, reset_num_timesteps=False)
+
+
+def test_another_family_replaces_the_one_of_which_nothing_was_collected(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    model.set_env(make_task_vec_env(ENV_ID, 4, env_kwargs={"goal_distance": 3.0}))
+    model.learn(ROLLOUT)
+    assert model.replay_buffer is not None and model.task_bank is not None
+    for family in (model.replay_buffer.task_family, model.task_bank.task_family):
+        assert vars(family)["goal_distance"] == 3.0
+
+
+class FarAway(gym.ObservationWrapper[Any, Any, Any]):
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+
+    def observation(self, observation: Any) -> Any:
+        return (observation + 1e5).astype(np.float32)
+
+
+@pytest.mark.filterwarnings("ignore:The posterior")
+@pytest.mark.parametrize("seed", range(3))
+def test_observations_may_be_large(seed: int, tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl(FarAway(gym.make(ENV_ID)), n_tasks_per_rollout=1, seed=seed, gradient_steps=10).learn(300)
+    assert np.isfinite(model.knowledge.sample_aggregate(5, 1.0)).all()
+
+
+def test_a_time_limit_around_an_env_is_one(tiny_pearl: MakePEARL) -> None:
+    env = gym.wrappers.TimeLimit(PointRobotEnv(), 7)
+    model = tiny_pearl(env, n_tasks_per_rollout=1).learn(20)
+    assert model.replay_buffer is not None and model.replay_buffer.max_episode_steps == 7
 
 
 def test_an_env_may_reuse_its_arrays(tiny_pearl: MakePEARL) -> None:
@@ -176,6 +269,17 @@ def test_an_env_may_reuse_its_arrays(tiny_pearl: MakePEARL) -> None:
 def test_a_meta_batch_may_be_larger_than_the_number_of_tasks(tiny_pearl: MakePEARL) -> None:
     env = make_task_vec_env(ENV_ID, 2, env_kwargs={"n_train_tasks": 2, "n_test_tasks": 1})
     tiny_pearl(env, n_tasks_per_rollout=2, meta_batch_size=50).learn(2 * ROLLOUT)
+
+
+def test_a_window_without_a_screen_is_refused_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("mujoco")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    env = gym.make("SparseWheeled-v0", render_mode="rgb_array")
+    env.reset()
+    with pytest.raises(DependencyNotInstalled, match=r"MUJOCO_GL is glfw, which needs a screen, .*: set MUJOCO_GL=egl"):
+        env.render()
 
 
 @pytest.mark.parametrize(
@@ -207,7 +311,8 @@ def test_what_cannot_be_trained_is_refused_in_one_sentence(
     monkeypatch.chdir(tmp_path)
     with pytest.raises((ValueError, ImportError), match=message) as refusal:
         main(["train", *arguments])
-    assert "\n" not in str(refusal.value) and not list(tmp_path.rglob("*.zip"))
+    assert "\n" not in str(refusal.value)
+    assert not list(tmp_path.rglob("*_1")), "no folder of a run that there is not"
 
 
 def test_only_the_envs_of_a_model_can_be_adapted_to(tiny_pearl: MakePEARL) -> None:

@@ -25,8 +25,9 @@ from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.adaptation import Belief, Explorer, Step
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
 from sb3_htr.experiments import grid, report
+from sb3_htr.experiments.cell import Evaluation
 from sb3_htr.experiments.grid import Experiment, Variant
-from sb3_htr.experiments.runner import run_cells
+from sb3_htr.experiments.runner import run_cell
 from sb3_htr.htr import Relabeller
 from sb3_htr.htr.relabel import RELABELLERS, HindsightDraw
 from sb3_htr.zoo.cli import main
@@ -339,15 +340,20 @@ def test_an_experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[str] = []
     tiny = {**yaml.safe_load("{n_envs: 4, learning_starts: 240}"), **{key: TINY[key] for key in TINY if key != "seed"}}
     row = Variant("htr-ser", "sharp", {**tiny, "explorer": {"margin": 0.7}})
-    experiment = Experiment("toy", "A toy.", ENV_ID, 960, (row,), 1, 480, explorers=("aggregate",), figure=figure)
+    experiment = Experiment(
+        "toy", "A toy.", ENV_ID, 960, (row,), 1, 480, evaluations=(Evaluation("aggregate", {}),), figure=figure
+    )
     monkeypatch.setattr("sb3_htr.experiments.protocol.EVAL_SEEDS", (1,))
     monkeypatch.setitem(grid.EXPERIMENTS, "toy", experiment)
     runs, results = tmp_path / "runs", tmp_path / "results"
-    report.write("python toy.py", experiment, run_cells(experiment.cells(), runs, 1), results)
+    runs.mkdir()
+    (cell,) = experiment.cells()
+    assert run_cell(cell, runs)
+    report.write("python toy.py", experiment, {cell: cell.result(runs)}, results)
     assert drawn == ["sharp"] and (results / "toy.png").exists()
     summary = json.loads((results / "summary.json").read_text())
     assert [row["variant"] for row in summary["rows"] if row["metric"] == "success_rate"] == drawn
-    agent = agent_at(experiment.cells()[0].run_folder(runs))
+    agent = agent_at(cell.run_folder(runs))
     assert agent.method == "htr-ser" and agent.load().explorer == Belief(margin=0.7)
 
 

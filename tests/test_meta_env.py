@@ -13,7 +13,7 @@ from gymnasium.wrappers import TimeLimit
 from helpers import TINY, MakePEARL, parameters
 from helpers.broken_envs import LineEnv
 from helpers.carts import make_cart
-from sb3_htr import PEARL, evaluate_adaptation
+from sb3_htr import PEARL, evaluate_adaptation, load_untrusted
 from sb3_htr.adaptation.evaluation import record_adaptation
 from sb3_htr.adaptation.loop import adaptation_steps
 from sb3_htr.common.vec_env import make_task_vec_env
@@ -45,11 +45,11 @@ def test_it_trains_adapts_and_goes_on(tiny_pearl: MakePEARL, tmp_path: Path, rec
     assert not [warning for warning in recwarn if "No reward was found" in str(warning.message)]
 
     model.save(tmp_path / "model")
-    loaded = PEARL.load(tmp_path / "model")
-    again, _ = evaluate_adaptation(loaded, make_cart(), n_episodes=3)
-    np.testing.assert_array_equal(again, returns)
-    with pytest.raises(ValueError, match="The explorer 'belief' goes by successes"):
-        loaded.adapt(make_cart(), explorer="belief")
+    for loaded in (PEARL.load(tmp_path / "model"), load_untrusted(tmp_path / "model.zip", make_cart())):
+        again, _ = evaluate_adaptation(loaded, make_cart(), n_episodes=3)
+        np.testing.assert_array_equal(again, returns)
+        with pytest.raises(ValueError, match="The explorer 'belief' goes by successes"):
+            loaded.adapt(make_cart(), explorer="belief")
 
     resumed = tiny_pearl(make_cart(), **PLAIN)
     state = copy.deepcopy(model.state_dict())

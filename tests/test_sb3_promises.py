@@ -1,5 +1,7 @@
 """What users of Stable-Baselines3 rely on in any algorithm."""
 
+import copy
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from stable_baselines3.common.logger import configure
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL
 from helpers import parameters as all_parameters
+from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.common.vec_env import make_task_vec_env
 
 
@@ -64,6 +67,40 @@ def test_training_goes_on_without_resetting_the_count(tiny_pearl: MakePEARL) -> 
     assert model.num_timesteps == ROLLOUT
 
 
+def test_a_model_that_goes_on_without_its_experience_says_so(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    model = tiny_pearl().learn(2 * ROLLOUT)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = PEARL.load(tmp_path / "model", env=make_task_vec_env(ENV_ID, 4))
+    with pytest.warns(UserWarning, match="The experience that this model was trained on is not there.*load_replay_buffer"):
+        loaded.learn(ROLLOUT)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        whole = PEARL.load(tmp_path / "model", env=make_task_vec_env(ENV_ID, 4))
+        whole.load_replay_buffer(tmp_path / "buffer")
+        whole.learn(ROLLOUT)
+        model.learn(ROLLOUT)
+        tiny_pearl().learn(2 * ROLLOUT)
+
+
+@pytest.mark.parametrize("env", [ENV_ID, "one env"])
+def test_a_deep_copy_learns_on_its_own(env: str, tiny_pearl: MakePEARL) -> None:
+    settings = {} if env == ENV_ID else {"n_tasks_per_rollout": 1}
+    model = tiny_pearl(ENV_ID if env == ENV_ID else gym.make(ENV_ID), **settings).learn(ROLLOUT)
+    twin, before = copy.deepcopy(model), all_parameters(model)
+    twin.learn(2 * ROLLOUT, reset_num_timesteps=False)
+    assert twin.num_timesteps == 3 * ROLLOUT and model.num_timesteps == ROLLOUT
+    assert all(th.equal(value, before[name]) for name, value in all_parameters(model).items())
+    assert any(not th.equal(value, before[name]) for name, value in all_parameters(twin).items())
+
+
+def test_an_evaluation_leaves_numpys_generator_alone(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    before = np.random.get_state(legacy=False)
+    evaluate_adaptation(model, ENV_ID, n_episodes=1)
+    np.testing.assert_equal(np.random.get_state(legacy=False), before)
+
+
 def test_sb3s_callbacks_work(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
     save = CheckpointCallback(60, str(tmp_path), save_replay_buffer=True)
     stop = StopTrainingOnMaxEpisodes(max_episodes=10)  # of each env
@@ -87,6 +124,8 @@ def test_envs_can_be_replaced_by_equal_ones_only(tiny_pearl: MakePEARL) -> None:
     model.learn(ROLLOUT, reset_num_timesteps=False)
     with pytest.raises(AssertionError, match="number of environments"):
         model.set_env(make_task_vec_env(ENV_ID, 3))
+    with pytest.raises(ValueError, match="The env is a gymnasium VectorEnv"):
+        model.set_env(gym.make_vec(ENV_ID, 4))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="Observation spaces do not match"):
         tiny_pearl().set_env(make_task_vec_env("SparseTargetSpeed-v0", 4))
     with pytest.raises(ValueError, match=r"The env has another task family: its goal_distance is 0\.5"):

@@ -1,7 +1,18 @@
 """What :meth:`sb3_htr.PEARL.adapt` returns."""
 
+import os
+from pathlib import Path
+from typing import Any
+
 import numpy as np
+import torch as th
 from stable_baselines3.common.policies import BasePolicy
+
+from sb3_htr.adaptation.actor_alone import acting_state, make_actor_alone
+from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.plain import load_plain
+
+FORMAT = 1
 
 
 class AdaptedAgent:
@@ -36,3 +47,43 @@ class AdaptedAgent:
         """
         actions, _ = self.policy.predict(observation, (self.z[None],), episode_start, deterministic)
         return actions, state
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """
+        Save what acting on this task takes: the actor, the normalization of observations, z. The file is small, is plain data,
+        and needs no model to be used.
+
+        :param path: file, ``.pt`` is added to a name without suffix; it is replaced at the end or not at all
+        :raises ValueError: for an actor of one's own
+        """
+        arrays = {name: th.from_numpy(np.array(getattr(self, name))) for name in ("z", "returns", "successes")}
+        with atomic_path(_with_suffix(path)) as temporary:
+            th.save({"format": FORMAT, "policy": acting_state(self.policy), **arrays}, temporary)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], device: th.device | str = "cpu") -> "AdaptedAgent":
+        """
+        :param path: file of :meth:`save`; reading it runs no code, whoever it is from
+        :param device: torch device
+        :return: an agent that acts as the one that was saved
+        :raises FileNotFoundError: if there is no such file
+        :raises ValueError: if it is another kind of file
+        """
+        path = _with_suffix(path)
+        try:
+            state: dict[str, Any] = load_plain(path)
+            if state["format"] != FORMAT:
+                raise ValueError
+            z, returns, successes = (state[name].numpy() for name in ("z", "returns", "successes"))
+            (latent_dim,) = z.shape
+            policy = make_actor_alone(state["policy"], latent_dim)
+        except FileNotFoundError:
+            raise
+        except Exception:  # whatever a stranger can put into a file
+            raise ValueError(f"{path} is damaged, or no agent saved by AdaptedAgent.save: nothing of it was loaded.") from None
+        return cls(policy.to(device), z, returns, successes)
+
+
+def _with_suffix(path: str | os.PathLike[str]) -> Path:
+    path = Path(path)
+    return path if path.suffix else path.with_suffix(".pt")

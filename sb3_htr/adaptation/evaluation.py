@@ -11,7 +11,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.loop import Adapts, adaptation_steps
-from sb3_htr.common.checks import check_is_not_normalized, get_task_family
+from sb3_htr.common.checks import check_is_no_gymnasium_vector_env, check_is_not_normalized, get_task_family
 from sb3_htr.common.vec_env import make_task_vec_env
 
 
@@ -101,6 +101,7 @@ def record_adaptation(
     """
     if n_episodes < 1:
         raise ValueError(f"n_episodes is {n_episodes}, expected at least 1.")
+    check_is_no_gymnasium_vector_env(env)
     n_tasks = 20 if tasks is None else len(tasks)
     if isinstance(env, str):
         env = make_task_vec_env(env, max(n_tasks, 1), seed)

@@ -1,5 +1,6 @@
 """Files that are never half written."""
 
+import errno
 import os
 import shutil
 import struct
@@ -28,9 +29,12 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     :param path: file or folder to make; its parent folders are made too
     :return: path to write to, with the same suffix; removed if writing fails
+    :raises OSError: if the folder cannot be written to
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
+    if not os.access(path.parent, os.W_OK):  # before whoever writes has done any work
+        raise PermissionError(errno.EACCES, "The folder cannot be written to", str(path.parent))
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     try:
         yield temporary

@@ -58,7 +58,10 @@ def read_checkpoint(folder: str | os.PathLike[str], device: th.device | str = "c
         intact = False
     if not intact:
         raise DamagedCheckpoint(f"{folder / STATE} is missing or not what was written: the checkpoint is damaged.")
-    state: dict[str, Any] = th.load(folder / STATE, map_location=device, weights_only=True)
+    try:
+        state: dict[str, Any] = th.load(folder / STATE, map_location=device, weights_only=True)
+    except Exception:  # whatever a stranger can put into a file, with its checksum beside it
+        raise DamagedCheckpoint(f"{folder / STATE} is not what sb3-htr writes, and may run code: it was not read.") from None
     return state
 
 

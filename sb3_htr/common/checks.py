@@ -23,6 +23,18 @@ TASK_ENV_ADVICE = "derive the env from htr_envs.TaskEnv and test it with htr_env
 VARIADIC = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
 
 
+def check_is_no_gymnasium_vector_env(env: Any) -> None:
+    """
+    :param env: that a user gave
+    :raises ValueError: if SB3 cannot use it, for which SB3 has a sentence about another library
+    """
+    if isinstance(env, gym.vector.VectorEnv):
+        raise ValueError(
+            "The env is a gymnasium VectorEnv, expected one of Stable-Baselines3: pass the env's id, or make it with "
+            "sb3_htr.make_task_vec_env(id, n_envs)."
+        )
+
+
 def check_spaces(env: VecEnv) -> None:
     """
     :param env: env to train on
@@ -124,17 +136,17 @@ def get_max_episode_steps(env: VecEnv) -> int:
     :return: its time limit
     :raises ValueError: if it has none
     """
-    if env.has_attr("max_episode_steps"):  # a batched env counts the steps itself
-        limit = env.get_attr("max_episode_steps")[0]
-    else:
-        spec = env.get_attr("spec")[0] if env.has_attr("spec") else None
-        limit = None if spec is None else spec.max_episode_steps
-    if limit is None:
+    # gymnasium's TimeLimit, or an env that counts the steps itself, as a batched one does
+    for name in ("_max_episode_steps", "max_episode_steps"):
+        if env.has_attr(name):
+            return int(env.get_attr(name)[0])
+    spec = env.get_attr("spec")[0] if env.has_attr("spec") else None
+    if spec is None or spec.max_episode_steps is None:
         raise ValueError(
             "The env has no time limit, so its episodes may never end: make it with gymnasium.make(id), "
             "registered with max_episode_steps."
         )
-    return int(limit)
+    return int(spec.max_episode_steps)
 
 
 def family_facts(family: TaskFamily) -> dict[str, str]:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch as th
 
+from sb3_htr.adaptation import Step
 from sb3_htr.adaptation.explorers import Belief, Explorer
 from sb3_htr.adaptation.knowledge import Particles
 
@@ -53,9 +54,18 @@ class NoValue(Belief):
             self.z[envs] = chosen
 
 
+@dataclass
+class NoInference(Belief):
+    """What the reward model says of rewards is ignored: the belief stays as it was beforehand."""
+
+    def infer(self, step: Step) -> None:
+        pass
+
+
 ABLATIONS: dict[str, Explorer] = {
     "belief, training tasks alone": TrainingTasksAlone(),
     "belief, uniform prior": UniformPrior(),
     "belief, no posterior": NoPosterior(),
     "belief, no value": NoValue(),
+    "belief, no inference": NoInference(),
 }

@@ -1,18 +1,34 @@
-"""One run of an experiment: what is trained, and how the final model is tested."""
+"""One run of an experiment: what is trained, and how the final model is evaluated."""
 
 import re
-import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 KwArgs = dict[str, Any]
+
+
+class Evaluation(NamedTuple):
+    """
+    How a final model adapts to the test tasks.
+
+    :param explorer: name
+    :param tested_on: arguments of the env that are other than in training
+    """
+
+    explorer: str
+    tested_on: KwArgs
+
+    @property
+    def name(self) -> str:
+        """In raw results."""
+        return " ".join([self.explorer, *(f"{key}={value}" for key, value in self.tested_on.items())])
 
 
 @dataclass(frozen=True, eq=False)
 class Cell:
     """
-    One training run and its tests.
+    One training run and the evaluations of its final model.
 
     :param experiment: name of the experiment
     :param models_of: name of the experiment whose runs these are; often the same
@@ -24,8 +40,7 @@ class Cell:
     :param eval_freq: env steps between evaluations on the validation tasks
     :param settings: hyperparameters, joined with those of env and method
     :param env_kwargs: arguments of the env
-    :param explorers: how the final model explores on the test tasks; one row of results for each
-    :param elsewhere: arguments of the envs that the final model is tested on as well, beside those of training
+    :param evaluations: what is done with the final model; one row of results for each
     """
 
     experiment: str
@@ -38,8 +53,7 @@ class Cell:
     eval_freq: int
     settings: KwArgs
     env_kwargs: KwArgs
-    explorers: tuple[str, ...]
-    elsewhere: tuple[KwArgs, ...]
+    evaluations: tuple[Evaluation, ...]
 
     @property
     def name(self) -> str:
@@ -61,31 +75,17 @@ class Cell:
         """
         return runs / self.experiment / f"{self.name}.npz"
 
-    @property
-    def tests(self) -> list[tuple[str, KwArgs]]:
-        """Explorers, and the arguments of the env that are other than in training: what the final model is tested with."""
-        return [(explorer, tested_on) for tested_on in ({}, *self.elsewhere) for explorer in self.explorers]
-
     def training(self, folder: Path) -> list[str]:
         """
         :param folder: log folder
-        :return: command line of the training
+        :return: arguments of ``sb3-htr train``
         """
         settings = [f"{key}:{value!r}" for key, value in self.settings.items()]
         kwargs = [f"{key}:{value!r}" for key, value in self.env_kwargs.items()]
         return [
-            *(sys.executable, "-m", "sb3_htr.zoo.cli", "train", "--env", self.env_id, "--method", self.method),
+            *("--env", self.env_id, "--method", self.method),
             *("-f", str(folder), "--verbose", "0", "-n", str(self.n_timesteps)),
             *("--seed", str(self.seed), "--eval-freq", str(self.eval_freq)),
             *(["-params", *settings] if settings else []),
             *(["--env-kwargs", *kwargs] if kwargs else []),
         ]
-
-
-def name_of_test(explorer: str, tested_on: KwArgs) -> str:
-    """
-    :param explorer: name
-    :param tested_on: arguments of the env that are other than in training
-    :return: how raw results name this test
-    """
-    return " ".join([explorer, *(f"{key}={value}" for key, value in tested_on.items())])

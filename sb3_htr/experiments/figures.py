@@ -8,7 +8,7 @@ import numpy as np
 
 from htr_envs import PointRobotFamily
 from sb3_htr.experiments.calibration import expected_calibration_error
-from sb3_htr.experiments.cell import Cell, name_of_test
+from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.protocol import scores
 from sb3_htr.zoo.plots.curves import band, finish
 from sb3_htr.zoo.plots.intervals import iqm_interval
@@ -48,7 +48,9 @@ def learning(results: Results, path: Path) -> None:
     for (colour, _), (variant, runs) in zip(curve_styles([*groups]), groups.items(), strict=True):
         curve = np.stack([raw["curve"].mean(axis=1) for _, raw in runs])
         band(left, runs[0][1]["timesteps"] / 1000, curve, colour, "-", variant)
-        for explorer, style in zip(runs[0][0].explorers, ("-", "--"), strict=False):
+        for explorer, style in zip(("belief", "prior"), ("-", "--"), strict=True):
+            if f"returns_{explorer}" not in runs[0][1]:
+                continue
             returns = np.stack([raw[f"returns_{explorer}"] for _, raw in runs])
             band(right, np.arange(1, returns.shape[-1] + 1), returns, colour, style, f"{variant}, explorer {explorer}")
     left.set_xlabel("thousand env steps of meta-training")
@@ -136,27 +138,29 @@ def relabelling(results: Results, path: Path) -> None:
     finish(figure, path, f"{next(iter(results)).env_id}: IQM over {n_seeds(results)} seeds, 95 % interval")
 
 
-def tests(results: Results, path: Path) -> None:
+def evaluations(results: Results, path: Path) -> None:
     """
-    Return of the last adaptation episode by each explorer, in each env that the models were tested on.
+    Return of the last adaptation episode by each explorer, in each env that the models were evaluated in.
 
     :param results: raw results of the cells of one variant
     :param path: picture to write
     """
     ((_, runs),) = by_variant(results).items()
     cell, raws = runs[0][0], [raw for _, raw in runs]
-    places = ({}, *cell.elsewhere)
+    explorers = list(dict.fromkeys(evaluation.explorer for evaluation in cell.evaluations))
+    places = [evaluation.tested_on for evaluation in cell.evaluations if evaluation.explorer == explorers[0]]
     size = (3 + 2 * len(places), 3.6)
     figure, grid = plt.subplots(1, len(places), figsize=size, layout="constrained", sharey=True, squeeze=False)
     for axes, tested_on in zip(grid.flat, places, strict=True):
-        for row, explorer in enumerate(cell.explorers):
-            estimate, low, high = iqm_interval(scores(raws, "last_episode_return", name_of_test(explorer, tested_on)))
+        for evaluation in [evaluation for evaluation in cell.evaluations if evaluation.tested_on == tested_on]:
+            row = explorers.index(evaluation.explorer)
+            estimate, low, high = iqm_interval(scores(raws, "last_episode_return", evaluation.name))
             axes.plot([low, high], [row, row], color=COLOURS[0], linewidth=3, alpha=0.4)
             axes.plot(estimate, row, "o", color=COLOURS[0])
         axes.set_title(", ".join(f"{key} {value}" for key, value in tested_on.items()) or "as in training", fontsize=10)
         axes.set_xlim(left=-0.5)
         axes.grid(alpha=0.25)
-    grid[0, 0].set_yticks(range(len(cell.explorers)), cell.explorers)
+    grid[0, 0].set_yticks(range(len(explorers)), explorers)
     grid[0, 0].invert_yaxis()
     figure.supxlabel("return of the last adaptation episode", fontsize=10)
     figure.suptitle(f"{cell.env_id}: IQM over {n_seeds(results)} seeds, 95 % interval", fontsize=11)

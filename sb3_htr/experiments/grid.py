@@ -7,7 +7,19 @@ from typing import Any
 
 from sb3_htr.experiments import figures
 from sb3_htr.experiments.ablations import ABLATIONS
-from sb3_htr.experiments.cell import Cell, KwArgs
+from sb3_htr.experiments.cell import Cell, Evaluation, KwArgs
+
+EXPLORERS = ("belief", "learned-prior", "aggregate", "prior")
+BELIEF = ("belief",)
+
+
+def by(explorers: tuple[str, ...], *places: KwArgs) -> tuple[Evaluation, ...]:
+    """
+    :param explorers: names
+    :param places: arguments of the env that are other than in training; none are by default
+    :return: evaluations by each explorer in each of these envs
+    """
+    return tuple(Evaluation(explorer, place) for place in places or ({},) for explorer in explorers)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +51,7 @@ class Experiment:
     :param variants: what is compared; the first is what the others are compared with
     :param seeds: runs of each variant
     :param eval_freq: env steps between evaluations on the validation tasks
-    :param explorers: how the final models explore on the test tasks
-    :param elsewhere: arguments of the envs that the final models are tested on as well, beside those of training
+    :param evaluations: what is done with the final models
     :param models_of: name of the experiment whose runs are tested; by default it trains its own
     :param figure: draws the results of all cells into a file
     """
@@ -52,8 +63,7 @@ class Experiment:
     variants: tuple[Variant, ...]
     seeds: int = 5
     eval_freq: int = 10_000
-    explorers: tuple[str, ...] = ("belief", "learned-prior", "aggregate", "prior")
-    elsewhere: tuple[KwArgs, ...] = ()
+    evaluations: tuple[Evaluation, ...] = by(EXPLORERS)
     models_of: str = ""
     figure: Callable[[dict[Cell, Path], Path], None] = figures.learning
 
@@ -75,8 +85,7 @@ class Experiment:
                 eval_freq=max(int(self.eval_freq * scale), 1),
                 settings=variant.settings,
                 env_kwargs=variant.env_kwargs,
-                explorers=self.explorers,
-                elsewhere=self.elsewhere,
+                evaluations=self.evaluations,
             )
             for seed in range(1, (seeds or self.seeds) + 1)
             for variant in self.variants
@@ -86,9 +95,10 @@ class Experiment:
 POINT, SPEED, WHEELED, ANT = "SparsePointRobot-v0", "SparseTargetSpeed-v0", "SparseWheeled-v0", "SparseAnt-v0"
 
 
-# The Point Robot's goals nearer and further away than in training, and those of the other robots further away
-DISTANCES: tuple[KwArgs, ...] = ({"goal_distance": 0.8}, {"goal_distance": 1.2}, {"goal_distance": 1.4})
-FURTHER: tuple[KwArgs, ...] = ({"goal_distance": 2.5},)
+# The Point Robot's goals: as in training, nearer, and further away
+DISTANCES: tuple[KwArgs, ...] = ({}, {"goal_distance": 0.8}, {"goal_distance": 1.2}, {"goal_distance": 1.4})
+# Those of the robots that take long to simulate, further away
+FURTHER = by(("belief", "aggregate"), {"goal_distance": 2.5})
 
 
 def replay(**settings: Any) -> dict[str, Any]:
@@ -106,7 +116,7 @@ ALL = (
         POINT,
         150_000,
         tuple(map(Variant, ("htr-ser", "htr-ec", "pearl-dense", "pearl-sparse", "pearl-sparse-prior"))),
-        elsewhere=DISTANCES,
+        evaluations=by(EXPLORERS, *DISTANCES),
     ),
     # What cannot be interpolated: training tasks avoid 40 degrees of the semicircle, in which all test tasks lie
     Experiment(
@@ -122,10 +132,9 @@ ALL = (
         POINT,
         150_000,
         (Variant("htr-ser"),),
-        explorers=("belief", *ABLATIONS, "learned-prior", "aggregate", "prior"),
-        elsewhere=DISTANCES,
+        evaluations=by((*BELIEF, *ABLATIONS, "aggregate"), *DISTANCES),
         models_of="point_robot",
-        figure=figures.tests,
+        figure=figures.evaluations,
     ),
     Experiment(
         "wheeled",
@@ -134,7 +143,7 @@ ALL = (
         600_000,
         tuple(map(Variant, ("htr-ser", "pearl-dense", "pearl-sparse"))),
         eval_freq=50_000,
-        elsewhere=FURTHER,
+        evaluations=(*by(EXPLORERS), *FURTHER),
     ),
     Experiment(
         "ant",
@@ -143,7 +152,7 @@ ALL = (
         600_000,
         tuple(map(Variant, ("htr-ser", "pearl-dense", "pearl-sparse"))),
         eval_freq=100_000,
-        elsewhere=FURTHER,
+        evaluations=(*by(EXPLORERS), *FURTHER),
     ),
     Experiment(
         "target_speed",
@@ -164,7 +173,7 @@ ALL = (
             for distance, n_steps in ((0.5, 20), (0.75, 20), (1.0, 20), (1.5, 30), (2.0, 40))
             for method in ("htr-ser", "pearl-dense", "pearl-sparse")
         ),
-        explorers=("belief",),
+        evaluations=by(BELIEF),
         figure=figures.goal_distance,
     ),
     # The first one is what the others are compared with; then the paper's sweep of K, and no relabelling
@@ -180,7 +189,7 @@ ALL = (
             Variant("htr-ser", "final state", replay(relabeller={"hindsight_task_strategy": "final"})),
             Variant("htr-ser", "RL batch of the task", replay(relabeller={"rl_batch_source": "task"})),
         ),
-        explorers=("belief",),
+        evaluations=by(BELIEF),
         figure=figures.relabelling,
     ),
     Experiment(
@@ -189,7 +198,7 @@ ALL = (
         POINT,
         150_000,
         (Variant("htr-ser", "float32"), Variant("htr-ser", "bfloat16", {"matmul_precision": "medium"})),
-        explorers=("belief",),
+        evaluations=by(BELIEF),
     ),
 )
 

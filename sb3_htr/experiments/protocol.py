@@ -10,7 +10,7 @@ from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.experiments.ablations import ABLATIONS
 from sb3_htr.experiments.calibration import calibration
-from sb3_htr.experiments.cell import Cell, KwArgs, name_of_test
+from sb3_htr.experiments.cell import Cell, KwArgs
 from sb3_htr.pearl.pearl import PEARL
 
 # A final model adapts to all test tasks once for each: of starting states, and of all that an explorer draws
@@ -23,40 +23,40 @@ Raw = Mapping[str, np.ndarray]
 
 def evaluate(cell: Cell, model: PEARL) -> KwArgs:
     """
-    :param cell: what the model is tested with
+    :param cell: says which evaluations
     :param model: at the end of its training
-    :return: for each test ``returns_<test>`` float32 and ``successes_<test>`` bool, (n_eval_seeds, n_tasks, n_episodes); and
+    :return: ``returns_<evaluation>`` float32 and ``successes_<evaluation>`` bool, (n_eval_seeds, n_tasks, n_episodes); and
         ``calibration``, see :func:`sb3_htr.experiments.calibration.calibration`
     """
     arrays: KwArgs = {}
-    for explorer, tested_on in cell.tests:
-        family = get_task_family(make_task_vec_env(cell.env_id, 1, env_kwargs={**cell.env_kwargs, **tested_on}))
-        env = make_task_vec_env(cell.env_id, len(family.test_tasks), env_kwargs={**cell.env_kwargs, **tested_on})
-        chosen = ABLATIONS.get(explorer, explorer)
-        records = [evaluate_adaptation(model, env, explorer=chosen, seed=seed) for seed in EVAL_SEEDS]
+    for evaluation in cell.evaluations:
+        env_kwargs = {**cell.env_kwargs, **evaluation.tested_on}
+        family = get_task_family(make_task_vec_env(cell.env_id, env_kwargs=env_kwargs))
+        env = make_task_vec_env(cell.env_id, len(family.test_tasks), env_kwargs=env_kwargs)
+        explorer = ABLATIONS.get(evaluation.explorer, evaluation.explorer)
+        records = [evaluate_adaptation(model, env, explorer=explorer, seed=seed) for seed in EVAL_SEEDS]
         returns, successes = (np.stack(arrays) for arrays in zip(*records, strict=True))
-        test = name_of_test(explorer, tested_on)
-        arrays |= {f"returns_{test}": returns.astype(np.float32), f"successes_{test}": successes}
+        arrays |= {f"returns_{evaluation.name}": returns.astype(np.float32), f"successes_{evaluation.name}": successes}
     return {**arrays, "calibration": calibration(model, cell.env_id, cell.env_kwargs)}
 
 
-def last_episode_return(raw: Raw, test: str) -> np.ndarray:
+def last_episode_return(raw: Raw, evaluation: str) -> np.ndarray:
     """(n_eval_seeds, n_tasks), return of the last adaptation episode."""
-    return raw[f"returns_{test}"][..., -1]
+    return raw[f"returns_{evaluation}"][..., -1]
 
 
-def success_rate(raw: Raw, test: str) -> np.ndarray:
+def success_rate(raw: Raw, evaluation: str) -> np.ndarray:
     """(n_eval_seeds, n_tasks), whether the last adaptation episode solved the task."""
-    return raw[f"successes_{test}"][..., -1].astype(np.float64)
+    return raw[f"successes_{evaluation}"][..., -1].astype(np.float64)
 
 
-def episodes_to_first_success(raw: Raw, test: str) -> np.ndarray:
+def episodes_to_first_success(raw: Raw, evaluation: str) -> np.ndarray:
     """(n_eval_seeds, n_tasks), the first episode that solved the task; one more than there are if none did."""
-    successes = raw[f"successes_{test}"]
+    successes = raw[f"successes_{evaluation}"]
     return np.where(successes.any(axis=-1), successes.argmax(axis=-1) + 1, successes.shape[-1] + 1)
 
 
-def loss_of_stability(raw: Raw, test: str) -> np.ndarray:
+def loss_of_stability(raw: Raw, evaluation: str) -> np.ndarray:
     """(1, 1), how far the worst of the last three evaluations on validation tasks is below the best of all."""
     means = raw["curve"].mean(axis=1)
     return np.atleast_2d(means.max() - means[-3:].min())
@@ -67,11 +67,11 @@ METRICS: dict[str, Callable[[Raw, str], np.ndarray]] = {
 }
 
 
-def scores(raws: list[Any], metric: str, test: str) -> np.ndarray:
+def scores(raws: list[Any], metric: str, evaluation: str) -> np.ndarray:
     """
     :param raws: raw results of runs
     :param metric: name
-    :param test: name
+    :param evaluation: name
     :return: (n_runs, n_eval_seeds, n_tasks)
     """
-    return np.stack([METRICS[metric](raw, test) for raw in raws])
+    return np.stack([METRICS[metric](raw, evaluation) for raw in raws])

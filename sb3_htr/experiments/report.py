@@ -11,7 +11,7 @@ import numpy as np
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.experiments import figures
 from sb3_htr.experiments.calibration import expected_calibration_error
-from sb3_htr.experiments.cell import Cell, name_of_test
+from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.grid import Experiment
 from sb3_htr.experiments.protocol import EVAL_SEEDS, METRICS, scores
 from sb3_htr.experiments.runner import LOGGED
@@ -27,7 +27,7 @@ def summarize(command: str, results: dict[Cell, Path]) -> dict[str, Any]:
     groups: dict[str, dict[str, list[Cell]]] = {}
     for cell in results:
         groups.setdefault(str(cell.env_kwargs), {}).setdefault(cell.variant, []).append(cell)
-    rows, differences = [], []
+    rows, differences, explorer_differences = [], [], []
     for variants in groups.values():
         references: dict[str, np.ndarray] = {}
         compared = next(iter(variants))
@@ -43,14 +43,18 @@ def summarize(command: str, results: dict[Cell, Path]) -> dict[str, Any]:
             means = {key: round(float(np.mean([raw[key] for raw in raws])), 4) for key in (*LOGGED, "wall_s")}
             calibration_error = expected_calibration_error(np.sum([raw["calibration"] for raw in raws], axis=0))
             means["calibration_error"] = round(calibration_error, 4)
-            for explorer, tested_on in first.tests:
-                test = name_of_test(explorer, tested_on)
-                tested = {**about, "explorer": explorer, "tested_on": tested_on}
+            first_explorers: dict[str, tuple[str, np.ndarray]] = {}
+            for evaluation in first.evaluations:
+                tested = {**about, **evaluation._asdict()}
                 for metric in METRICS:
-                    interval = _rounded(iqm_interval(scores(raws, metric, test)))
+                    interval = _rounded(iqm_interval(scores(raws, metric, evaluation.name)))
                     rows.append({**tested, "metric": metric, **interval, **means})
-                returns = scores(raws, "last_episode_return", test)
-                reference = references.setdefault(test, returns)
+                returns = scores(raws, "last_episode_return", evaluation.name)
+                reference = references.setdefault(evaluation.name, returns)
+                explorer, by_it = first_explorers.setdefault(str(evaluation.tested_on), (evaluation.explorer, returns))
+                if explorer != evaluation.explorer:
+                    difference = {**tested, "of": explorer, "metric": "last_episode_return"}
+                    explorer_differences.append({**difference, **_rounded(iqm_interval(by_it - returns))})
                 if variant != compared:
                     difference = {**tested, "of": compared, "metric": "last_episode_return"}
                     differences.append({**difference, **_rounded(iqm_difference(reference, returns))})
@@ -65,6 +69,8 @@ def summarize(command: str, results: dict[Cell, Path]) -> dict[str, Any]:
         "rows": rows,
         # first variant minus this one, by the same explorer on the same tasks
         "differences": differences,
+        # first explorer minus this one, of the same models
+        "explorer_differences": explorer_differences,
     }
 
 

@@ -1,54 +1,80 @@
-"""Runs the cells of an experiment, several at a time, and picks up where a killed one stopped."""
+"""One cell, in whatever process an executor calls it: claimed, trained from where it was, and evaluated."""
 
-import json
-import os
-import subprocess
-import sys
-from concurrent.futures import ThreadPoolExecutor
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock, Timeout
 
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr import PEARL
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.resume import checkpoints
 from sb3_htr.experiments.cell import Cell
-from sb3_htr.experiments.protocol import evaluate, last_episode_return
+from sb3_htr.experiments.protocol import evaluate
+from sb3_htr.zoo.commands import train
 from sb3_htr.zoo.run.agents import RECORD, agent_at, file_stem, find_runs, read_record
 
 # Means over the training of what HTR paper, B.2 reasons with
 LOGGED = ("relabelled_fraction", "rl_reward_mean", "rl_zero_reward_fraction")
 
 
-def run_cell(cell: Cell, runs: Path) -> Path:
+def claim(cell: Cell, runs: Path) -> FileLock:
     """
-    Train, unless there is a finished run, then test the final model.
+    :param cell: of an experiment
+    :param runs: folder of all experiments' runs
+    :return: what a process has as long as it runs the cell; the system takes it back when the process ends, however it does
+    """
+    return FileLock(cell.run_folder(runs) / ".claim")
+
+
+def run_cell(cell: Cell, runs: Path) -> bool:
+    """
+    Train, unless there is a finished run, then evaluate the final model.
+
+    The result is an npz with ``timesteps``, ``curve`` (n, n_tasks) on validation tasks; what
+    :func:`sb3_htr.experiments.protocol.evaluate` tells of the final model; the means of what is in ``LOGGED``; ``wall_s`` of
+    the training and ``commit`` of the code that trained. What would be printed is in the ``log.txt`` of its folder.
 
     :param cell: what to run
     :param runs: folder of all experiments' runs; a cell that has a result there is not run again
-    :return: npz with ``timesteps``, ``curve`` (n, n_tasks) on validation tasks; what
-        :func:`sb3_htr.experiments.protocol.evaluate` tells of the final model; the means of what is in ``LOGGED``;
-        ``wall_s`` of the training and ``commit`` of the code that trained
+    :return: whether there is a result; if not, another process runs the cell
+    :raises FileNotFoundError: if there is no such folder
     :raises ValueError: if the run in the cell's folder is another one
+    :raises KeyboardInterrupt: if the training was stopped before its end, with a checkpoint
     """
+    if not runs.is_dir():
+        raise FileNotFoundError(f"There is no folder {runs} on this node: give --runs that all nodes see.")
     result, folder = cell.result(runs), cell.run_folder(runs)
-    if result.exists():
-        return result
-    folder.mkdir(parents=True, exist_ok=True)
+    for path in (folder, result.parent):
+        path.mkdir(parents=True, exist_ok=True)
+    try:
+        with claim(cell, runs).acquire(timeout=0):
+            if not result.exists():
+                with _logged(folder / "log.txt"):
+                    arrays = _train_and_evaluate(cell, folder)
+                with atomic_path(result) as path:
+                    np.savez_compressed(path, **arrays)
+            return True
+    except Timeout:
+        return False
+
+
+def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
     trained = find_finished(cell, folder)
     if trained is None:
-        with open(folder / "log.txt", "a") as log:
-            environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-            subprocess.run(_resume(folder) or cell.training(folder), check=True, stdout=log, stderr=log, env=environment)
+        unfinished = [run for run in folder.glob("*/*") if checkpoints(run)]
+        train.main(["--resume", str(unfinished[-1])] if unfinished else cell.training(folder))
         trained = find_finished(cell, folder)
         if trained is None:
-            raise RuntimeError(f"The training in {folder} ended before its {cell.n_timesteps:,} env steps: see its log.txt.")
+            raise KeyboardInterrupt
     run, model = trained
     evaluations = np.load(run / "evaluations.npz")
     progress = np.genfromtxt(run / "progress.csv", delimiter=",", names=True, deletechars="")
-    arrays: dict[str, Any] = {
+    return {
         **{key: np.nanmean(progress[f"train/{key}"]) for key in LOGGED},
         "timesteps": evaluations["timesteps"],
         "curve": evaluations["results"],
@@ -56,11 +82,6 @@ def run_cell(cell: Cell, runs: Path) -> Path:
         "commit": _commit_of(run),
         **evaluate(cell, model),
     }
-    with atomic_path(result) as path:
-        np.savez_compressed(path, **arrays)
-    scores = {explorer: round(float(last_episode_return(arrays, explorer).mean()), 2) for explorer in cell.explorers}
-    print(f"{cell.experiment}/{cell.name}: {json.dumps(scores)}")
-    return result
 
 
 def find_finished(cell: Cell, folder: Path) -> tuple[Path, PEARL] | None:
@@ -86,10 +107,14 @@ def find_finished(cell: Cell, folder: Path) -> tuple[Path, PEARL] | None:
     return None
 
 
-def _resume(folder: Path) -> list[str] | None:
-    """Command that goes on with a run that was killed, None if there is none."""
-    unfinished = [run for run in folder.glob("*/*") if checkpoints(run)]
-    return [sys.executable, "-m", "sb3_htr.zoo.cli", "train", "--resume", str(unfinished[-1])] if unfinished else None
+@contextmanager
+def _logged(file: Path) -> Iterator[None]:
+    with open(file, "a", buffering=1) as log, redirect_stdout(log), redirect_stderr(log):
+        try:
+            yield
+        except Exception:
+            traceback.print_exc()
+            raise
 
 
 def _wall_time(elapsed: np.ndarray) -> float:
@@ -102,15 +127,3 @@ def _commit_of(run: Path) -> str:
     """Of the code that trained, as it was when the training began."""
     record = read_record(run / RECORD)
     return f"{record.get('commit', 'unknown')}{'' if record.get('clean', True) else ' with changes'}"
-
-
-def run_cells(cells: list[Cell], runs: Path, jobs: int) -> dict[Cell, Path]:
-    """
-    :param cells: runs of the experiment
-    :param runs: folder of all experiments' runs
-    :param jobs: number of runs at a time, each on one thread
-    :return: the result file of each cell
-    """
-    with ThreadPoolExecutor(jobs) as pool:
-        paths = list(pool.map(lambda cell: run_cell(cell, runs), cells))
-    return dict(zip(cells, paths, strict=True))

@@ -3,6 +3,7 @@
 import io
 import pathlib
 import pickle
+import traceback
 import warnings
 import zipfile
 from collections import deque
@@ -182,6 +183,7 @@ class OffPolicyMetaAlgorithm(SAC):
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        checks.check_is_no_gymnasium_vector_env(env)
         return in_float32(SAC._wrap_env(env, verbose, monitor_wrapper))
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
@@ -254,6 +256,13 @@ class OffPolicyMetaAlgorithm(SAC):
         return shown
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        assert self.replay_buffer is not None
+        if self._n_updates > 0 and self.replay_buffer.size() == 0:
+            warnings.warn(
+                "The experience that this model was trained on is not there, so it goes on with new episodes alone: "
+                "load_replay_buffer brings back what save_replay_buffer has saved.",
+                stacklevel=3,
+            )
         result = super()._setup_learn(*args, **kwargs)
         if self._pending_random is not None:
             self._set_random_state(self._pending_random)
@@ -349,7 +358,9 @@ class OffPolicyMetaAlgorithm(SAC):
         try:
             return next(steps, None)
         except ValueError as error:
-            shape = ": its observations must have the shape of its observation_space" if "broadcast" in str(error) else ""
+            # Where SB3 stores what the env returned; within the env, an error is the env's own
+            stored = traceback.extract_tb(error.__traceback__)[-1].name == "_save_obs"
+            shape = ": its observations must have the shape of its observation_space" if stored else ""
             raise ValueError(f"An env failed {where} ({error}){shape}.") from error
         except (EOFError, ConnectionError) as error:
             raise RuntimeError(

@@ -3,35 +3,35 @@
 import io
 import json
 import os
+import re
 import zipfile
 from typing import Any
 
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.utils import LinearSchedule
 
+from sb3_htr.common.plain import MAX_BYTES, load_plain
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.pearl.pearl import PEARL
 from sb3_htr.pearl.policies import PEARLPolicy
 
-# What a file may unpack to, and how large its networks may be
-MAX_BYTES, MAX_LAYERS, MAX_UNITS = 2**30, 16, 2**14
+# How large networks may be
+MAX_LAYERS, MAX_UNITS = 16, 2**14
 EXPLORERS = ("explorer", "train_explorer")
-# Numbers among the arguments of PEARL that take no memory, and counters
+# Of an object, SB3 writes its plain attributes beside its type and its pickle
+TYPE, PICKLED = ":type:", ":serialized:"
+# Arguments of PEARL that are numbers and take no memory, those that may be words, and counters
 NUMBERS = (
-    *(
-        "learning_rate",
-        "learning_starts",
-        "batch_size",
-        "tau",
-        "gamma",
-        "gradient_steps",
-        "ent_coef",
-        "target_update_interval",
-    ),
-    *("meta_batch_size", "context_size", "kl_coef", "n_tasks_per_rollout", "n_episodes_per_task"),
+    *("learning_rate", "learning_starts", "batch_size", "tau", "gamma", "gradient_steps", "ent_coef", "target_entropy"),
+    *("target_update_interval", "meta_batch_size", "context_size", "kl_coef", "reward_coef"),
+    *("n_tasks_per_rollout", "n_episodes_per_task"),
 )
+WORDS = {"ent_coef": r"auto(_\d+(\.\d+)?)?", "target_entropy": "auto", "matmul_precision": "highest|high|medium"}
 COUNTERS = ("num_timesteps", "_n_updates")
+# Arguments of the replay buffer that are plain data
+REPLAY = ("relabel_probability", "relabeller", "rl_reward_type", "context_episodes")
 
 
 def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.device | str = "auto", **kwargs: Any) -> PEARL:
@@ -40,8 +40,10 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
     weights take.
 
     SB3's ``load`` unpickles what is no plain JSON in the file, and a pickle can run anything. This function reads the sizes of
-    the networks, the explorers and their settings, and plain numbers; it makes a new model with them and fills in the weights.
-    Schedules and the settings of the replay buffer, which only training needs, are left at their defaults.
+    the networks, the explorers, the relabeller and their settings, a linear schedule, and plain numbers and words; it makes a
+    new model with them and fills in the weights. What only training needs is left at its default where it is no plain data:
+    other schedules, a relabeller that is an object, a replay buffer of one's own. An entropy coefficient that is learnt begins
+    anew.
 
     :param path: file of ``PEARL.save``
     :param env: env of the same spaces; its spaces are not read from the file
@@ -54,6 +56,11 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
         data, weights = _read(path)
         settings: dict[str, Any] = {name: _plain(data[name]) for name in EXPLORERS}
         settings |= {name: data[name] for name in NUMBERS if type(data.get(name)) in (int, float)}
+        settings |= {name: data[name] for name, words in WORDS.items() if re.fullmatch(words, str(data.get(name)))}
+        settings |= _schedule(data.get("learning_rate"))
+        replay = data.get("replay_buffer_kwargs")
+        replay = replay if isinstance(replay, dict) else {}
+        settings["replay_buffer_kwargs"] = {name: replay[name] for name in REPLAY if name in replay and PICKLED not in replay}
         counters = {name: data[name] for name in COUNTERS if type(data.get(name)) is int}
         settings["policy_kwargs"] = _policy_kwargs(data.get("policy_kwargs", {}))
     except Exception as error:  # whatever a stranger can put into a file
@@ -78,18 +85,24 @@ def _read(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, Any]]
         if sum(info.file_size for info in archive.infolist()) > MAX_BYTES:
             raise ValueError(f"PEARL's files do not unpack to more than {MAX_BYTES} bytes.")
         data = json.loads(archive.read("data"))
-        weights = {
-            name: th.load(io.BytesIO(archive.read(f"{name}.pth")), map_location="cpu", weights_only=True)
-            for name in ("policy", "knowledge")
-        }
+        weights = {name: load_plain(io.BytesIO(archive.read(f"{name}.pth"))) for name in ("policy", "knowledge")}
     if not all(isinstance(value, dict) for value in (data, *weights.values())):
         raise TypeError
     return data, weights
 
 
 def _plain(explorer: dict[str, Any]) -> dict[str, Any]:
-    """Of an object, SB3 writes its plain attributes beside the pickle."""
-    return {key: value for key, value in explorer.items() if not key.startswith(":")}
+    return {key: value for key, value in explorer.items() if key not in (TYPE, PICKLED)}
+
+
+def _schedule(learning_rate: Any) -> dict[str, LinearSchedule]:
+    """Of the kind that ``lin_...`` of YAML files is."""
+    if not isinstance(learning_rate, dict) or learning_rate.get(TYPE) != str(LinearSchedule):
+        return {}
+    numbers = [learning_rate[name] for name in ("start", "end", "end_fraction")]
+    if not all(type(number) in (int, float) for number in numbers):
+        raise TypeError
+    return {"learning_rate": LinearSchedule(*numbers)}
 
 
 def _policy_kwargs(given: dict[str, Any]) -> dict[str, Any]:

@@ -19,20 +19,19 @@ COMMANDS = {
     "optimize": "search for hyperparameters with Optuna, by the return after adaptation",
     "experiment": "repeat one of the experiments of this project",
     "export": "a small file to share, with a model card; can upload both to the Hugging Face Hub",
+    "load_from_hub": "download an agent from there",
 }
 USAGE = (
     "usage: sb3-htr COMMAND [ARGUMENTS]; sb3-htr COMMAND --help explains the arguments, sb3-htr --version the versions.\n\n"
-    + "\n".join(f"  {name:<10} {text}" for name, text in COMMANDS.items())
+    + "\n".join(f"  {name:<13} {text}" for name, text in COMMANDS.items())
     + "\n\nTo begin with, an agent that comes with the package:\n\n  sb3-htr enjoy --env SparsePointRobot-v0"
 )
 # Packages that the base installation does not bring, and the extra that does
 EXTRAS = {
-    "rl_zoo3": "zoo",
-    "optuna": "zoo",
-    "huggingface_hub": "zoo",
-    "matplotlib": "plots",
-    "rliable": "plots",
+    **dict.fromkeys(("rl_zoo3", "optuna", "sqlalchemy", "yaml", "huggingface_hub", "filelock"), "zoo"),
+    **dict.fromkeys(("matplotlib", "rliable", "pandas", "scipy"), "plots"),
     "PIL": "video",
+    "pygame": "video",
     "imageio_ffmpeg": "video",
     "mujoco": "mujoco",
     "gymnasium_robotics": "robotics",
@@ -40,6 +39,7 @@ EXTRAS = {
     "metaworld": "metaworld",
     "tensorboard": "tensorboard",
     "psycopg": "postgresql",
+    "ray": "ray",
 }
 # What a user can put right, and has a sentence of its own: bad settings and files, missing packages, unknown envs, training
 # that diverges

@@ -7,7 +7,7 @@ import torch as th
 from helpers import ENV_ID
 from helpers.adaptations import begin, know_tasks, play, walk
 from sb3_htr import PEARL
-from sb3_htr.experiments.ablations import ABLATIONS, NoPosterior, NoValue, TrainingTasksAlone, UniformPrior
+from sb3_htr.experiments.ablations import ABLATIONS, NoInference, NoPosterior, NoValue, TrainingTasksAlone, UniformPrior
 
 
 @pytest.fixture
@@ -28,6 +28,7 @@ def places(model: PEARL, explorer: object, task: float = 3.0) -> list[float]:
 def test_the_parts_of_the_default_explorer(model: PEARL) -> None:
     assert 3 in places(model, "belief"), "a hindsight task is found"
     assert set(places(model, TrainingTasksAlone())) <= {0, 1}, "without particles of hindsight tasks it is not"
+    assert set(places(model, NoInference())) == {0}, "without inference, the likeliest stays so"
     prior = begin(model, UniformPrior()).explorer
     assert isinstance(prior, UniformPrior) and prior.weights(np.arange(1)).tolist() == [[0.25] * 4]
     for name, explorer in ABLATIONS.items():

@@ -9,7 +9,7 @@ import pytest
 import tables
 
 from sb3_htr.experiments import figures, report
-from sb3_htr.experiments.cell import Cell, name_of_test
+from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.grid import EXPERIMENTS
 from sb3_htr.experiments.protocol import EVAL_SEEDS, METRICS
 from sb3_htr.experiments.runner import LOGGED
@@ -27,10 +27,10 @@ def made_up(cells: list[Cell], folder: Path) -> dict[Cell, Path]:
         }
         arrays |= {"commit": "abc", **{key: 0.5 for key in LOGGED}}
         arrays["calibration"] = np.tile([[4.0, 1.0, 2.0]], (10, 1))
-        for explorer, tested_on in cell.tests:
-            test = name_of_test(explorer, tested_on)
-            arrays[f"returns_{test}"] = np.full((len(EVAL_SEEDS), 20, 6), float(cell.seed + len(tested_on)), dtype=np.float32)
-            arrays[f"successes_{test}"] = np.broadcast_to(np.arange(6) >= 2, (len(EVAL_SEEDS), 20, 6))
+        for evaluation in cell.evaluations:
+            returns = float(cell.seed + len(evaluation.tested_on))
+            arrays[f"returns_{evaluation.name}"] = np.full((len(EVAL_SEEDS), 20, 6), returns, dtype=np.float32)
+            arrays[f"successes_{evaluation.name}"] = np.broadcast_to(np.arange(6) >= 2, (len(EVAL_SEEDS), 20, 6))
         results[cell] = folder / f"{cell.name}.npz"
         np.savez(results[cell], **arrays)
     assert len({cell.name for cell in cells}) == len(cells), "two runs of one name would overwrite each other"
@@ -46,7 +46,7 @@ def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monk
     assert all((folder / picture).stat().st_size > 10_000 for picture in (f"{name}.png", "reliability.png"))
     raw = np.load(folder / "raw.npz")
     assert {key.split("/")[0] for key in raw.files} == {cell.name for cell in cells}
-    assert all((raw[f"{cell.name}/returns_{cell.explorers[0]}"] == cell.seed).all() for cell in cells)
+    assert all((raw[f"{cell.name}/returns_belief"] == cell.seed).all() for cell in cells)
     summary = json.loads((folder / "summary.json").read_text())
     value = {"last_episode_return": 2.0, "success_rate": 1.0, "episodes_to_first_success": 3.0, "loss_of_stability": 1.0}
     variants = {(cell.variant, str(cell.env_kwargs)): cell for cell in cells}
@@ -57,24 +57,28 @@ def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monk
         assert row["iqm"] == value[row["metric"]] + elsewhere and row["n_seeds"] == 3 and row["calibration_error"] == 0.25
         assert (row["method"], row["settings"], row["env_steps"]) == (cell.method, cell.settings, cell.n_timesteps)
         assert row["low"] <= row["iqm"] <= row["high"] and row["method"] in methods()
-    n_tests = len(experiment.explorers) * (1 + len(experiment.elsewhere))
+    n_tests = len(experiment.evaluations)
     assert len(summary["rows"]) == len(variants) * n_tests * len(value)
     n_settings = len({str(cell.env_kwargs) for cell in cells})
     assert len(summary["differences"]) == (len(variants) - n_settings) * n_tests
     assert all(difference["low"] <= 0 <= difference["high"] for difference in summary["differences"])
+    for difference in summary["explorer_differences"]:
+        assert difference["explorer"] != difference["of"] and difference["low"] == difference["iqm"] == difference["high"] == 0
+    n_places = len({str(evaluation.tested_on) for evaluation in experiment.evaluations})
+    assert len(summary["explorer_differences"]) == len(variants) * (n_tests - n_places)
     assert {difference["of"] for difference in summary["differences"]} <= {experiment.variants[0].name or "htr-ser"}
     table = tables.table(summary)
     assert table.count("| 1.00 [1.00, 1.00] | 3.00 [3.00, 3.00] |") == len(variants) * n_tests
     assert "3 runs, **fewer than the 5 that a claim needs**" in table and "5 evaluation seeds" in table
-    assert all(
-        table.count(f"| goal distance {kwargs['goal_distance']} |")
-        == n_tests / (1 + len(experiment.elsewhere)) * len(variants)
-        for kwargs in experiment.elsewhere
-    )
+    for place in {str(evaluation.tested_on): evaluation.tested_on for evaluation in experiment.evaluations}.values():
+        here = sum(evaluation.tested_on == place for evaluation in experiment.evaluations)
+        has_column = here < n_tests
+        label = f"| goal distance {place['goal_distance']} |" if place else "| as in training |"
+        assert table.count(label) == len(variants) * here * has_column
     assert f"`sb3-htr experiment {name}`, commit abc" in table
     headline = tables.headline({name: summary})
     shown = [cell for cell in variants.values() if cell.variant in tables.METHODS] if name in tables.ENVS else []
-    assert headline.count("| 2.0 [1.") == len(shown) * len(experiment.explorers)
+    assert headline.count("| 2.0 [1.") == len(shown) * sum(not evaluation.tested_on for evaluation in experiment.evaluations)
     assert all(f"| {cell.n_timesteps:,} | 3 | {cell.variant} | `prior` | 2.0 [1." in headline for cell in shown)
 
 

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import subprocess
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,9 +12,11 @@ import pytest
 from helpers import ENV_ID
 from sb3_htr.common.resume import checkpoints
 from sb3_htr.experiments import grid
-from sb3_htr.experiments.grid import Experiment, Variant
+from sb3_htr.experiments.cell import Cell
+from sb3_htr.experiments.grid import Experiment, Variant, by
 from sb3_htr.experiments.runner import find_finished, run_cell
 from sb3_htr.zoo.cli import main
+from sb3_htr.zoo.commands import train
 from sb3_htr.zoo.run.agents import agent_at
 
 SMALL: dict[str, Any] = {
@@ -42,33 +43,34 @@ def refuse(*_: Any, **__: Any) -> None:
 
 
 def test_a_killed_run_goes_on_and_a_finished_one_is_tested(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    variant = Variant("htr-ser", "tiny", SMALL)
-    experiment = Experiment("one", "", ENV_ID, 1200, (variant,), 1, 480, ("belief", "prior"), ({"goal_distance": 0.3},))
+    variant = Variant("htr-ser", "tiny", SMALL, {"n_test_tasks": 10})
+    experiment = Experiment("one", "", ENV_ID, 1200, (variant,), 1, 480, by(("belief", "prior"), {}, {"goal_distance": 0.3}))
     (cell,) = experiment.cells()
     folder = cell.run_folder(tmp_path)
-    killed = subprocess.run([*cell.training(folder), "--save-freq", "1"], check=False, capture_output=True, text=True)
-    assert killed.returncode == 0, killed.stderr
+    train.main([*cell.training(folder), "--save-freq", "1"])
     run = next(folder.glob("*/*"))
     (run / f"{cell.env_id}.zip").unlink()
     steps = checkpoints(run)[0].name
-    result = run_cell(cell, tmp_path)
+    result = cell.result(tmp_path)
+    assert run_cell(cell, tmp_path)
     assert f"Going on from {run / 'checkpoints' / steps}" in (folder / "log.txt").read_text()
     raw = np.load(result)
     assert raw["timesteps"].tolist() == [480, 960] and len(list(folder.glob("*/*"))) == 1
     tests = ["belief", "prior", "belief goal_distance=0.3", "prior goal_distance=0.3"]
     assert [key for key in raw if key.startswith("returns_")] == [f"returns_{test}" for test in tests]
-    assert all(raw[f"returns_{test}"].shape == raw[f"successes_{test}"].shape == (2, 100, 20) for test in tests)
+    assert all(raw[f"returns_{test}"].shape == raw[f"successes_{test}"].shape == (2, 10, 20) for test in tests)
     assert raw["successes_prior goal_distance=0.3"].sum() > raw["successes_prior"].sum(), "near goals are found by chance"
     assert (raw["returns_prior goal_distance=0.3"][0] != raw["returns_prior goal_distance=0.3"][1]).any()
-    monkeypatch.setattr(subprocess, "run", refuse)
+    monkeypatch.setattr(train, "main", refuse)
     changed = result.stat().st_mtime_ns
-    assert run_cell(cell, tmp_path) == result and result.stat().st_mtime_ns == changed, "a result is not made again"
+    assert run_cell(cell, tmp_path) and result.stat().st_mtime_ns == changed, "a result is not made again"
     # As from another place, where it was trained: without checkpoints and results
     shutil.rmtree(run / "checkpoints")
-    others = replace(cell, experiment="other", explorers=("prior",), elsewhere=())
-    again = np.load(run_cell(others, tmp_path))
+    others = replace(cell, experiment="other", evaluations=by(("prior",)))
+    assert run_cell(others, tmp_path)
+    again = np.load(others.result(tmp_path))
     assert (again["returns_prior"] == raw["returns_prior"]).all() and "returns_belief" not in again
-    with pytest.raises(ValueError, match="seed 1, but other/tiny-seed2 needs 2: move this run away"):
+    with pytest.raises(ValueError, match="seed 1, but other/tiny-n_test_tasks10-seed2 needs 2: move this run away"):
         find_finished(replace(others, seed=2), folder)
     assert find_finished(replace(others, n_timesteps=1200), tmp_path / "nowhere") is None
 
@@ -78,8 +80,11 @@ def test_the_command_repeats_an_experiment(
 ) -> None:
     """With `--quick`, one seed and a tenth of the env steps; each cell trains by its method, with its settings."""
     settings = {**SMALL, "replay_buffer_kwargs": {"relabeller": {"cell_size": 0.3}}}
-    variants = (Variant("htr-ec", "coarse", settings, {"goal_distance": 0.5}), Variant("pearl-sparse-prior", "", SMALL))
-    experiment = Experiment("tiny", "Two tiny runs.", ENV_ID, 9600, variants, eval_freq=4800, explorers=("belief",))
+    variants = (
+        Variant("htr-ec", "coarse", settings, {"goal_distance": 0.5, "n_test_tasks": 4}),
+        Variant("pearl-sparse-prior", "", SMALL, {"n_test_tasks": 4}),
+    )
+    experiment = Experiment("tiny", "Two tiny runs.", ENV_ID, 9600, variants, eval_freq=4800, evaluations=by(("belief",)))
     monkeypatch.setitem(grid.EXPERIMENTS, "tiny", experiment)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit):
@@ -92,7 +97,25 @@ def test_the_command_repeats_an_experiment(
     assert summary["command"] == "sb3-htr experiment tiny --quick", "what repeats these results"
     coarse, plain = (agent_at(cell.run_folder(runs)) for cell in experiment.cells(1, 0.1))
     assert (coarse.method, plain.method) == ("htr-ec", "pearl-sparse-prior")
-    assert coarse.record["env_kwargs"] == {"goal_distance": 0.5} and coarse.record["n_timesteps"] == 960
+    assert coarse.record["env_kwargs"] == {"goal_distance": 0.5, "n_test_tasks": 4} and coarse.record["n_timesteps"] == 960
     relabeller: Any = coarse.load(trust=True).replay_buffer_kwargs["relabeller"]
     assert relabeller["name"] == "EpisodeClustering" and relabeller["cell_size"] == 0.3
     assert plain.load().explorer.name == "prior"
+
+
+def test_one_cell_of_a_job_array_writes_no_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(grid.EXPERIMENTS, "pair", Experiment("pair", "", ENV_ID, 480, (Variant("htr-ser"),), 2))
+    ran: list[tuple[str, Path]] = []
+
+    def make_result(cell: Cell, runs: Path) -> bool:
+        cell.result(runs).parent.mkdir(parents=True)
+        cell.result(runs).touch()
+        ran.append((cell.name, runs))
+        return True
+
+    monkeypatch.setattr("sb3_htr.experiments.driver.run_cell", make_result)
+    monkeypatch.chdir(tmp_path)
+    assert main(["experiment", "pair", "--cell", "1", "--runs", "here"]) == 0
+    assert ran == [("htr-ser-seed2", tmp_path / "here")] and not Path("results").exists()
+    with pytest.raises(ValueError, match="--cell is 2, expected 0 to 1"):
+        main(["experiment", "pair", "--cell", "2"])

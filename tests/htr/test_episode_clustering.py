@@ -1,5 +1,6 @@
 """EC: relabelling when the data comes in, in hindsight buffers of a discretised task space."""
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -93,6 +94,19 @@ def test_exploratory_episodes_keep_their_share() -> None:
     assert shares[0.0] == 1.0 > shares[0.3] > shares[0.7]
     # Exploratory episodes may be rewarded by chance, so that the share is a bound
     assert shares[0.3] >= 0.7 - 0.05 and shares[0.7] >= 0.3 - 0.05
+
+
+def test_a_hindsight_buffer_holds_each_episode_once(tiny_pearl: MakePEARL) -> None:
+    """In cells as large as the robot's world, an episode solves and explores the same task."""
+    relabeller = {"name": "EpisodeClustering", "cell_size": 1.0}
+    buffer: Any = tiny_pearl(replay_buffer_kwargs={"relabeller": relabeller}).learn(5 * 240).replay_buffer
+    episodes = buffer.relabeller.episodes
+    index, n_episodes = episodes.index(), 0
+    for first, last in pairwise(index.task_row):
+        rows = episodes.rows[index.rows[first:last]].reshape(-1, 20 * episodes.rows.shape[1])
+        n_episodes += len(rows)
+        assert len(np.unique(rows, axis=0)) == len(rows)
+    assert n_episodes > 50
 
 
 def test_memory_grows_with_the_number_of_hindsight_buffers() -> None:

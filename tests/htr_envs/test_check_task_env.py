@@ -10,7 +10,7 @@ from gymnasium.wrappers import TimeLimit
 
 from helpers.broken_envs import BROKEN, LineEnv, LineFamily, column
 from helpers.carts import CartEnv
-from htr_envs import check_task_env
+from htr_envs import PointRobotEnv, check_task_env
 
 # Annotations here are wide on purpose: most of these classes break the types that they should have.
 
@@ -28,6 +28,11 @@ def assert_refused(env: gym.Env[Any, Any], sentence: str) -> None:
 def test_a_good_env_passes_wrapped_or_not() -> None:
     check_task_env(LineEnv())
     check_task_env(TimeLimit(LineEnv(), 7))
+
+
+def test_an_env_without_a_time_limit_is_refused_here_as_it_is_in_training() -> None:
+    assert_refused(PointRobotEnv(), "The env has no time limit: register it with max_episode_steps")
+    check_task_env(TimeLimit(PointRobotEnv(), 20))
 
 
 def test_the_check_leaves_no_given_task_behind() -> None:

@@ -1,26 +1,33 @@
 """Files from strangers and damaged ones: nothing of them runs, and one sentence says what is wrong."""
 
 import base64
+import inspect
 import io
 import json
 import pickle
+import random
+import re
 import threading
 import zipfile
 from pathlib import Path
 from typing import Any
 
 import cloudpickle  # type: ignore[import-untyped]
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
+from stable_baselines3.common.utils import LinearSchedule
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL, many
 from helpers.bombs import Bomb, bombs
-from sb3_htr import PEARL, evaluate_adaptation, load_untrusted
+from sb3_htr import PEARL, AdaptedAgent, evaluate_adaptation, load_untrusted
 from sb3_htr.adaptation import Belief, Prior
 from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.htr import EpisodeClustering
+from sb3_htr.pearl.untrusted import NUMBERS, WORDS
 
 
 def repack(source: Path, target: Path, changed: dict[str, bytes]) -> None:
@@ -79,17 +86,39 @@ def test_loading_an_untrusted_model_runs_no_code(tiny_pearl: MakePEARL, tmp_path
 
 def test_an_untrusted_model_acts_as_the_one_that_was_saved(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
     explorers: dict[str, Any] = {"explorer": Belief(margin=2.0), "train_explorer": Prior(2)}
-    model = tiny_pearl(gamma=0.7, kl_coef=0.02, context_size=7, **explorers).learn(3 * ROLLOUT)
+    replay = {"relabeller": {"name": "EpisodeClustering", "cell_size": 0.3}, "relabel_probability": 0.4}
+    rate = LinearSchedule(2e-3, 1e-4, 0.5)
+    settings = {"learning_rate": rate, "replay_buffer_kwargs": replay, **explorers}
+    model = tiny_pearl(gamma=0.7, kl_coef=0.02, context_size=7, **settings).learn(3 * ROLLOUT)
     model.save(tmp_path / "model.zip")
     loaded = load_untrusted(tmp_path / "model.zip", ENV_ID)
     assert loaded.gamma == 0.7 and loaded.kl_coef == 0.02 and loaded.context_size == 7
     assert loaded.num_timesteps == model.num_timesteps and loaded._n_updates == model._n_updates
+    assert loaded.replay_buffer_kwargs == replay and vars(loaded.learning_rate) == vars(rate)
     assert loaded.explorer == Belief(margin=2.0) and loaded.train_explorer == Prior(2)
     assert load_untrusted(tmp_path / "model.zip", ENV_ID, explorer="prior").explorer == Prior()
     for a, b in zip(evaluate_adaptation(model, ENV_ID), evaluate_adaptation(loaded, ENV_ID), strict=True):
         np.testing.assert_array_equal(a, b)
+    tiny_pearl(ent_coef="auto_0.3", target_entropy=-1.5, matmul_precision="medium").save(tmp_path / "words.zip")
+    words = load_untrusted(tmp_path / "words.zip", ENV_ID)
+    assert (words.ent_coef, words.target_entropy, words.matmul_precision) == ("auto_0.3", -1.5, "medium")
+    # What is pickled is left away
+    tiny_pearl(learning_rate=lambda _: 1.0, replay_buffer_kwargs={"relabeller": EpisodeClustering(0.2)}).save(
+        tmp_path / "own.zip"
+    )
+    own = load_untrusted(tmp_path / "own.zip", ENV_ID)
+    assert own.learning_rate == 1e-3 and own.replay_buffer_kwargs == {}
     with pytest.raises(ValueError, match="do not fit the env or the settings"):
         load_untrusted(tmp_path / "model.zip", "SparseTargetSpeed-v0", policy_kwargs={"latent_dim": 7})
+
+
+def test_no_plain_setting_of_pearl_is_forgotten() -> None:
+    """Those that are left out take memory, or are the user's."""
+    for name, parameter in inspect.signature(PEARL).parameters.items():
+        if type(parameter.default) in (int, float) and name not in ("buffer_size", "stats_window_size", "verbose"):
+            assert name in NUMBERS, name
+        if isinstance(parameter.default, str) and name not in ("explorer", "train_explorer", "device"):
+            assert re.fullmatch(WORDS[name], parameter.default), name
 
 
 @many
@@ -113,6 +142,37 @@ def test_truncated_files_are_refused(tiny_pearl: MakePEARL, tmp_path: Path, part
         load_untrusted(tmp_path / "model.zip", ENV_ID)
     with pytest.raises(ValueError, match="is damaged"):
         model.load_replay_buffer(tmp_path / "buffer.pt")
+
+
+def test_flipped_bits_are_noticed_or_harmless(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    """A hundred in each kind of file."""
+    model = tiny_pearl().learn(ROLLOUT)
+    agent = model.adapt(gym.make(ENV_ID), n_episodes=1)
+    model.save(tmp_path / "model.zip")
+    model.save_replay_buffer(tmp_path / "buffer.pt")
+    agent.save(tmp_path / "agent.pt")
+    assert model.replay_buffer is not None
+    rows, actor, places = model.replay_buffer.episodes.rows, model.policy.state_dict(), random.Random(0)
+    noticed = dict.fromkeys(("model.zip", "buffer.pt", "agent.pt"), 0)
+    for name in noticed:
+        whole = (tmp_path / name).read_bytes()
+        for _ in range(100):
+            damaged = bytearray(whole)
+            damaged[places.randrange(len(damaged))] ^= 1 << places.randrange(8)
+            (tmp_path / name).write_bytes(damaged)
+            try:
+                if name == "model.zip":  # which has more than is read here: states of optimizers
+                    weights = load_untrusted(tmp_path / name, ENV_ID).policy.state_dict()
+                    assert all(th.equal(weights[key], value) for key, value in actor.items())
+                elif name == "buffer.pt":
+                    model.load_replay_buffer(tmp_path / name)
+                    np.testing.assert_array_equal(model.replay_buffer.episodes.rows, rows)
+                else:
+                    weights = AdaptedAgent.load(tmp_path / name).policy.state_dict()
+                    assert all(th.equal(actor[key], value) for key, value in weights.items())
+            except ValueError:
+                noticed[name] += 1
+    assert min(noticed.values()) > 50
 
 
 def test_a_replay_buffer_of_other_settings_is_refused(tiny_pearl: MakePEARL, tmp_path: Path) -> None:

@@ -1,26 +1,25 @@
 """Agents found and shared, and what the commands say to mistakes."""
 
+import ast
 import json
 import re
 import shutil
 import sys
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch as th
-import yaml
+from stable_baselines3.common.utils import LinearSchedule
 
 import sb3_htr
 from helpers import ENV_ID, MakePEARL, with_policy
 from helpers.runs import NOWHERE, SHIPPED, make_run, run_folder
-from sb3_htr import PEARL, evaluate_adaptation, load_untrusted
+from sb3_htr import PEARL, load_untrusted
 from sb3_htr.adaptation.evaluation import AdaptationRecord, record_adaptation
 from sb3_htr.zoo import cli
 from sb3_htr.zoo.cli import main
-from sb3_htr.zoo.commands.export import push_to_hub
 from sb3_htr.zoo.run import model_card
 from sb3_htr.zoo.run.agents import RECORD, agent_at, agent_for
 from sb3_htr.zoo.run.shipped import shipped
@@ -78,7 +77,11 @@ def test_agents_that_are_not_there_are_said_to_be_so(tmp_path: Path, tiny_pearl:
 
 
 def test_export_is_small_exact_and_plain(run: Path, tmp_path: Path, tiny_pearl: MakePEARL) -> None:
-    model = tiny_pearl(tensorboard_log=str(tmp_path / "secret"))
+    schedule, replay = (
+        LinearSchedule(1e-3, 0.0, 1.0),
+        {"relabel_probability": 0.3, "relabeller": {"name": "EpisodeClustering"}},
+    )
+    model = tiny_pearl(tensorboard_log=str(tmp_path / "secret"), learning_rate=schedule, replay_buffer_kwargs=replay)
     model.learn(500)
     model.save(run / "best_model.zip")
     file = tmp_path / "agent.zip"
@@ -95,6 +98,8 @@ def test_export_is_small_exact_and_plain(run: Path, tmp_path: Path, tiny_pearl: 
         for ours, theirs in zip(expected, record_adaptation(loaded, ENV_ID, n_episodes=3), strict=True):
             np.testing.assert_array_equal(ours, theirs)
     assert exported.num_timesteps == model.num_timesteps and exported.gamma == model.gamma
+    for loaded in (exported, untrusted):
+        assert str(loaded.learning_rate) == str(schedule) and loaded.replay_buffer_kwargs == replay
     # A start for a training of one's own
     exported = PEARL.load(file, env=model.env)
     exported.learn(500)
@@ -110,42 +115,6 @@ def test_a_model_of_another_version_is_said_to_be_one(tmp_path: Path, tiny_pearl
         main(["enjoy", str(tmp_path / "mixed.zip"), "--no-render"])
     with pytest.raises(ValueError, match=r"mixed.zip has other networks than this version makes \(it is of sb3_htr 0.1.0\)"):
         main(["enjoy", str(tmp_path / "mixed.zip"), "--no-render", "--trust"])
-
-
-def test_a_folder_to_share_says_how_to_use_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    uploaded = {}
-
-    class HfApi:
-        def create_repo(self, repo_id: str, private: bool, exist_ok: bool) -> Any:
-            assert private and exist_ok
-            return type("RepoUrl", (str,), {"repo_id": repo_id})(f"https://hub/{repo_id}")
-
-        def upload_folder(self, repo_id: str, folder_path: Path, commit_message: str) -> None:
-            uploaded[repo_id] = {path.name for path in folder_path.iterdir()}
-
-    monkeypatch.setattr("huggingface_hub.HfApi", HfApi)
-    arguments = ["export", *NOWHERE, "--n-episodes", "6", "-o", str(tmp_path), "--push-to-hub", "me/agent", "--private"]
-    assert main(arguments) == 0
-    assert uploaded == {"me/agent": {"README.md", f"{ENV_ID}.zip"}}
-    assert "Uploaded to https://hub/me/agent" in capsys.readouterr().out
-    monkeypatch.setattr(HfApi, "upload_folder", lambda *_, **__: (_ for _ in ()).throw(ConnectionError("no network")))
-    with pytest.raises(OSError, match=f"The upload to me/agent failed, the files are in {tmp_path}: no network"):
-        push_to_hub(tmp_path, "me/agent", private=True)
-    card = (tmp_path / "README.md").read_text()
-    metadata = yaml.safe_load(card.split("---")[1])
-    assert metadata["library_name"] == "stable-baselines3" and ENV_ID in metadata["tags"]
-    value = metadata["model-index"][0]["results"][0]["metrics"][0]["value"]
-    returns, _ = evaluate_adaptation(PEARL.load(SHIPPED), ENV_ID, n_episodes=6)
-    assert (
-        value == f"{returns[:, -1].mean():.2f} +/- {returns[:, -1].std():.2f}" and f"| {value.replace('+/-', '±')} |" in card
-    )
-    assert "$ sb3-htr train --env SparsePointRobot-v0 --eval-freq 10000 --seed 1 --method htr-ser\n" in card
-    # The snippet, with the download replaced by the file
-    monkeypatch.setattr("huggingface_hub.hf_hub_download", lambda repo, name: str(tmp_path / name))
-    exec(re.findall(r"```python\n(.*?)```", card, re.DOTALL)[0], {})
-    assert main(["enjoy", str(tmp_path), "--no-render", "--n-tasks", "1", "--n-episodes", "1"]) == 0
 
 
 def test_normalized_agents_are_exported_with_their_statistics(tmp_path: Path, tiny_pearl: MakePEARL) -> None:
@@ -182,6 +151,17 @@ def test_missing_extras_are_named_with_the_pip_command(
     monkeypatch.setitem(sys.modules, package, None)
     assert main([command, "--env", ENV_ID]) == 1
     assert f"needs {package}, which is not installed: pip install 'sb3_htr[{extra}]'" in capsys.readouterr().err
+
+
+def test_every_package_that_a_command_may_miss_has_its_extra() -> None:
+    """A bare ``sb3-htr export`` once said that there is no yaml."""
+    installed = {"gymnasium", "numpy", "torch", "stable_baselines3", "sb3_htr", "htr_envs", "tqdm", *sys.stdlib_module_names}
+    for file in Path(cli.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            for package in {name.split(".")[0] for name in names} - installed:
+                assert package in cli.EXTRAS, f"{file.name} imports {package}"
 
 
 def test_the_console_answers_mistakes_in_one_sentence(

@@ -153,7 +153,7 @@ def test_the_name_is_recorded_and_stays_with_the_agent(
     assert main(["train", "--resume", str(run)]) == 0
     assert [path.name for path in Path("logs").iterdir()] == [name], "it goes on where it was"
     assert main(["export", str(run), "-o", "agent", "--n-episodes", "2"]) == 0
-    with zipfile.ZipFile(f"agent/{ENV_ID}.zip") as archive:
+    with zipfile.ZipFile(f"agent/pearl-{ENV_ID}.zip") as archive:
         exported = json.loads(archive.read(RECORD))
     assert exported["method"] == name and f"--method {name}" in exported["command"]
     card = Path("agent/README.md").read_text()

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from helpers import ENV_ID, MakePEARL
-from helpers.runs import NOWHERE, SHIPPED
+from helpers.disks import disk
+from helpers.runs import NOWHERE, SHIPPED, make_run
 from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.show.captions import Captioner
@@ -117,6 +118,20 @@ def test_films_that_cannot_be_made(tmp_path: Path, tiny_pearl: MakePEARL, monkey
     with pytest.raises(ValueError, match="A gif holds at most 5 frames"):
         main(["record", *NOWHERE, "-o", str(tmp_path / "film.gif"), "--verbose", "0"])
     assert not list(tmp_path.iterdir()), "no half of a film is left"
+
+
+def test_a_film_on_a_full_disk_is_no_film(tmp_path: Path, tiny_pearl: MakePEARL, capfd: pytest.CaptureFixture[str]) -> None:
+    make_run(tmp_path / "runs", tiny_pearl())
+    few = ["record", str(tmp_path / "runs"), "--n-tasks", "1", "--n-episodes", "2", "--every", "5", "--verbose", "0"]
+    with disk(tmp_path, 8) as small:
+        with pytest.raises(OSError, match=r"film.mp4 could not be written to its end: is the disk full\?"):
+            main([*few, "-o", str(small / "film.mp4")])
+        assert not list(small.iterdir())
+    capfd.readouterr()
+    with disk(tmp_path, 8, "ro") as read_only:
+        with pytest.raises(PermissionError, match=f"The folder cannot be written to: '{read_only}'"):
+            main([*few, "-o", str(read_only / "film.mp4")])
+    assert "ffmpeg" not in capfd.readouterr().err
 
 
 def test_captions_know_what_was_worst(tmp_path: Path) -> None:

@@ -222,6 +222,13 @@ def test_help_and_mistakes(capsys: pytest.CaptureFixture[str], tmp_path: Path) -
     assert main([]) == 2 and "usage: sb3-htr" in capsys.readouterr().err
     assert main(["trian"]) == 2 and "no command 'trian', did you mean train?" in capsys.readouterr().err
     assert main(["--version"]) == 0 and f"sb3_htr {sb3_htr.__version__}" in capsys.readouterr().out
+    assert main(["tarin"]) == 2 and "no command 'tarin', did you mean train?" in capsys.readouterr().err
+    for command, other in (("train", "optimize"), ("optimize", "train")):
+        with pytest.raises(SystemExit):
+            main([command, "--help"])
+        output = capsys.readouterr().out
+        assert output.startswith(f"sb3-htr {command}: ") and f"usage: sb3-htr {command} " in output
+        assert f"sb3-htr {other}: " not in output and "--algo {pearl}" in output
     with pytest.raises(ValueError, match="--algo is 'sac', but sb3-htr trains pearl"):
         main(["train", "--env", ENV_ID, "--algo", "sac"])
     with pytest.raises(FileNotFoundError, match="There is no run in"):

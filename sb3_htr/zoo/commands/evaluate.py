@@ -49,7 +49,7 @@ def main(argv: Sequence[str]) -> None:
     )
     print(f"{agent.path}: adapting to {len(tasks)} {args.tasks} tasks of {agent.env_id}, explorer {explorer!r}")
     print(table(record))
-    output = args.output or agent.folder or Path(agent.env_id)
+    output = args.output or agent.folder or Path(agent.stem)
     with atomic_path(output / "adaptation.npz") as path:
         np.savez_compressed(path, tasks=tasks, **record._asdict())
     pictures = [output / "adaptation_curve.png"]

@@ -14,10 +14,11 @@ from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checks import get_task_family
 from sb3_htr.zoo.commands.arguments import add_agent_arguments, make_parser, parse
 from sb3_htr.zoo.run.agents import RECORD, TrainedAgent
+from sb3_htr.zoo.run.hub import CARD, FILM, files, model_name, push
 from sb3_htr.zoo.run.model_card import model_card, training_command
 
 EXAMPLE = """  sb3-htr export runs/htr-ser/SparsePointRobot-v0_1 -o my_agent
-  sb3-htr export runs --film --push-to-hub USER/pearl-SparsePointRobot-v0
+  sb3-htr export runs --film --push-to-hub USER                    as USER/pearl-SparsePointRobot-v0
   sb3-htr export runs -o agent.zip                                 the file alone"""
 # What a loaded model needs beside the arguments of PEARL
 ALSO_KEPT = ("observation_space", "action_space", "policy_class", "n_envs", "num_timesteps", "_n_updates")
@@ -28,7 +29,7 @@ KEPT_OF_RECORD = ("env_id", "method", "env_kwargs", "gym_packages", "seed", "n_t
 def export(agent: TrainedAgent, path: Path, trust: bool = False) -> dict[str, Any]:
     """
     Write a model file without optimizer states, replay, statistics of training and local paths. ``PEARL.load`` reads it, and
-    the commands find in it which env it is for. Actor and encoder are exact; the critics, which acting does not need, are kept
+    the commands find in it which env it is for. Actor and encoder are exact; the critics, whose values only rank tasks, are kept
     in half precision, and their targets are the same as they.
 
     :param agent: to export
@@ -62,27 +63,20 @@ def export(agent: TrainedAgent, path: Path, trust: bool = False) -> dict[str, An
     return record
 
 
-def push_to_hub(folder: Path, repo_id: str, private: bool = False) -> str:
+def make_room(folder: Path, names: Sequence[str]) -> None:
     """
-    :param folder: everything in it is uploaded
-    :param repo_id: ``user/name``; made if there is none
-    :param private: make it private
-    :return: address of the model's page
-    :raises OSError: if that fails
-    """
-    from huggingface_hub import HfApi
-    from huggingface_hub.errors import HfHubHTTPError
+    Take away what an earlier export has left, so that the folder holds one model only.
 
-    # Its bases are OSError and what the HTTP library raises, which is another one in other versions of huggingface_hub
-    failures: tuple[type[Exception], ...] = (ValueError, *HfHubHTTPError.__bases__)
-    api = HfApi()
-    try:
-        repo = api.create_repo(repo_id, private=private, exist_ok=True)
-        api.upload_folder(repo_id=repo.repo_id, folder_path=folder, commit_message="PEARL agent of sb3_htr")
-    except failures as error:
-        reason = " ".join(str(error).split())
-        raise OSError(f"The upload to {repo_id} failed, the files are in {folder}: {reason}") from error
-    return str(repo)
+    :param folder: to write to
+    :param names: of what an export writes
+    :raises ValueError: if there is anything else in it
+    """
+    found = [path.name for path in folder.iterdir() if not path.name.startswith(".")] if folder.is_dir() else []
+    others = sorted(set(found) - set(names))
+    if others:
+        raise ValueError(f"{folder} holds other files, such as {others[0]}: give a folder of its own, with -o.")
+    for name in found:
+        (folder / name).unlink()
 
 
 def main(argv: Sequence[str]) -> None:
@@ -93,29 +87,34 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("-o", "--output", type=Path, help="folder, or .zip for the file alone (default: exported/ENV_ID)")
     parser.add_argument("--n-episodes", type=int, default=20, metavar="N", help="adaptation episodes for the scores (20)")
     parser.add_argument("--film", action="store_true", help="add replay.mp4, which the Hub shows (needs the extra video)")
-    parser.add_argument("--push-to-hub", metavar="USER/NAME", help="upload; log in with `hf auth login` first")
+    parser.add_argument("--push-to-hub", metavar="USER[/NAME]", help="upload; log in with `hf auth login` first")
     parser.add_argument("--private", action="store_true", help="with --push-to-hub: a private repository")
     args, agent = parse(parser, argv)
     output = args.output or Path("exported") / agent.stem
     alone = output.suffix == ".zip"
     if alone and (args.push_to_hub or args.film):
         raise ValueError(f"--push-to-hub and --film need a folder, but the output is the file {output}.")
-    file = output if alone else output / f"{agent.stem}.zip"
+    if not alone:
+        make_room(output, files(agent.env_id))
+    file = output if alone else output / f"{model_name(agent.env_id)}.zip"
     record = export(agent, file, args.trust)
     print(f"{file}: {file.stat().st_size / 1e6:.2f} MB, of {agent.path}")
     if alone:
         return
     exported = TrainedAgent(file, record, None)
-    model, env = exported.load(), exported.make_vec_env(20)
+    model, env = exported.load(trust=args.trust), exported.make_vec_env(20)
     tasks = get_task_family(env).test_tasks
     explorers = dict.fromkeys([model.explorer.name, "prior"])
     scores = {explorer: record_adaptation(model, env, tasks, args.n_episodes, explorer=explorer) for explorer in explorers}
-    with atomic_path(output / "README.md") as temporary:
-        temporary.write_text(model_card(record, scores, args.push_to_hub))
-    print(f"{output / 'README.md'}: model card, with scores on the test tasks")
+    repo_id = args.push_to_hub
+    if repo_id is not None and "/" not in repo_id:
+        repo_id += f"/{model_name(agent.env_id)}"
+    with atomic_path(output / CARD) as temporary:
+        temporary.write_text(model_card(record, scores, repo_id))
+    print(f"{output / CARD}: model card, with scores on the test tasks")
     if args.film:
         from sb3_htr.zoo.commands import record as recording
 
-        recording.main([str(file), "-o", str(output / "replay.mp4"), "--verbose", "0"])
-    if args.push_to_hub:
-        print(f"Uploaded to {push_to_hub(output, args.push_to_hub, args.private)}")
+        recording.main([str(file), "-o", str(output / FILM), "--verbose", "0", *["--trust"] * args.trust])
+    if repo_id is not None:
+        print(f"Uploaded to {push(output, repo_id, agent.env_id, args.private)}")

@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+import imageio_ffmpeg
+
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.zoo.commands.arguments import add_agent_arguments, make_parser, parse
 from sb3_htr.zoo.commands.enjoy import add_task_arguments, can_be_drawn, watch
@@ -15,6 +17,20 @@ EXAMPLE = """  sb3-htr record --env SparsePointRobot-v0                       Sp
   sb3-htr record --env SparseAnt-v0 --every 3 --speed 2"""
 # Seconds that the last frame of an episode, and of a task, is held
 EPISODE_END, TASK_END = 0.4, 1.2
+
+
+def is_whole(film: Path) -> bool:
+    """
+    :param film: that was written
+    :return: whether it can be read to its end: the encoder does not tell when it could not write
+    """
+    if film.suffix != ".mp4":
+        return True
+    try:
+        imageio_ffmpeg.count_frames_and_secs(film)
+    except RuntimeError:
+        return False
+    return True
 
 
 def main(argv: Sequence[str]) -> None:
@@ -46,4 +62,6 @@ def main(argv: Sequence[str]) -> None:
 
         watch(agent, args, args.every, show)
         film.close()
+        if not is_whole(temporary):
+            raise OSError(f"{output} could not be written to its end: is the disk full?")
     print(f"{output}: {len(film.seconds)} frames, {sum(film.seconds):.0f} seconds, {output.stat().st_size / 1e6:.1f} MB")

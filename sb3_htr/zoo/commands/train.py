@@ -7,14 +7,13 @@ from pathlib import Path
 
 from htr_envs.goal_env import find_hidden
 from sb3_htr.common.resume import n_steps_done
-from sb3_htr.zoo.run.agents import RECORD, file_stem, find_run, read_record
+from sb3_htr.zoo.run.agents import OF_TRAINING, RECORD, file_stem, find_run, read_record
 from sb3_htr.zoo.run.manager import run_rl_zoo
 from sb3_htr.zoo.run.memory import keep_freed_memory
 from sb3_htr.zoo.run.method import get_method
 from sb3_htr.zoo.run.shipped import hyperparams_file
-from sb3_htr.zoo.run.trust import check_arguments, import_packages
+from sb3_htr.zoo.run.trust import CONF, check_arguments, import_packages
 
-CONF = ("-conf", "--conf-file")
 HELP = """sb3-htr train: rl_zoo3's train (its arguments follow) with PEARL and evaluations that adapt to validation tasks.
 
 examples:
@@ -49,7 +48,8 @@ def main(argv: Sequence[str]) -> None:
     args, rest = parser.parse_known_args(argv)
     env = [] if args.env is None else ["--env", args.env]
     wants_help = bool({"-h", "--help"} & set(rest))
-    if wants_help:
+    program = "sb3-htr optimize" if "-optimize" in rest else "sb3-htr train"
+    if wants_help and "-optimize" not in rest:
         print(HELP)
     if args.algo != "pearl":
         raise ValueError(f"--algo is {args.algo!r}, but sb3-htr trains pearl: `python -m rl_zoo3.train` has SB3's algorithms.")
@@ -66,13 +66,15 @@ def main(argv: Sequence[str]) -> None:
             raise ValueError(f"train --resume goes on with the run's own arguments: leave {given} away.")
         run = find_run(args.resume)
         record = read_record(run / RECORD)
+        if not {*OF_TRAINING} <= record.keys():
+            raise ValueError(f"{run} is no run of sb3-htr train, so there is nothing to go on with: give the folder of one.")
         planned = record["n_timesteps"] + further.n_timesteps
         if n_steps_done(run) >= planned and (run / f"{file_stem(record['env_id'])}.zip").exists():
             print(f"{run} is finished, after {planned:,} env steps. To train further: sb3-htr train --resume {run} -n STEPS")
             return
         arguments, args.method = [*record["arguments"], "--seed", str(record["seed"])], record["method"]
         arguments += ["-n", str(planned)]
-        check_arguments(arguments, run / RECORD, args.trust)
+        check_arguments(arguments, record["gym_packages"], run / RECORD, args.trust)
         import_packages(args.gym_packages, record["gym_packages"], run / RECORD, args.trust)
         find_hidden(record["env_id"])
     else:
@@ -89,7 +91,7 @@ def main(argv: Sequence[str]) -> None:
         find_hidden(args.env or "")
     keep_freed_memory()
     try:
-        run_rl_zoo("sb3-htr train", arguments, args.method, run, args.trust)
+        run_rl_zoo(program, arguments, args.method, run, args.trust)
     except (NameError, SyntaxError) as error:
         raise ValueError(
             f"{error}: the values of -params and --env-kwargs are Python, with strings in quotes, as in \"explorer:'prior'\"."

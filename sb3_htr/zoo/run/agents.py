@@ -16,11 +16,15 @@ from stable_baselines3.common.vec_env import VecEnv
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr import PEARL, load_untrusted
 from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.zoo.run.folder import run_number
 from sb3_htr.zoo.run.method import get_method, methods
 from sb3_htr.zoo.run.shipped import shipped
 
 # Record of a run: in its folder, and in an exported model file
 RECORD = "run.json"
+# What it must say, and what it may say for training on and for model cards
+REQUIRED = {"env_id": str, "env_kwargs": dict, "gym_packages": list}
+OF_TRAINING = {"arguments": list, "n_timesteps": int, "seed": int, "method": str, "hyperparams": dict}
 
 
 @dataclass(frozen=True)
@@ -120,10 +124,12 @@ def read_record(path: Path, content: bytes | None = None) -> dict[str, Any]:
     """
     try:
         record = json.loads(path.read_bytes() if content is None else content)
-        texts = record["env_id"], *record["gym_packages"]
-        if isinstance(record["env_kwargs"], dict) and all(isinstance(text, str) for text in texts):
+        given = {name: kind for name, kind in OF_TRAINING.items() if name in record}
+        texts = *record["gym_packages"], *record.get("arguments", ())
+        kinds_are_right = all(type(record[name]) is kind for name, kind in {**REQUIRED, **given}.items())
+        if kinds_are_right and all(isinstance(text, str) for text in texts):
             return cast(dict[str, Any], record)
-    except (ValueError, KeyError, TypeError, RecursionError):
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         pass
     raise ValueError(f"{path} is damaged, or no record of a run: it must say env_id, env_kwargs and gym_packages.")
 
@@ -215,10 +221,10 @@ def agent_for(
     numbers: list[str] = []
     stem = file_stem(env_id)
     for name in names:
-        runs = [path.parent for path in Path(folder, name).glob(f"{stem}_*/{RECORD}") if _number(path.parent, stem) > 0]
-        runs = sorted(runs, key=lambda run: _number(run, stem), reverse=True)
-        numbers += [f"{_number(run, stem)} ({name})" for run in reversed(runs)]
-        for run in [run for run in runs if exp_id in (0, _number(run, stem))]:
+        runs = [path.parent for path in Path(folder, name).glob(f"{stem}_*/{RECORD}") if run_number(path.parent, stem) > 0]
+        runs = sorted(runs, key=lambda run: run_number(run, stem), reverse=True)
+        numbers += [f"{run_number(run, stem)} ({name})" for run in reversed(runs)]
+        for run in [run for run in runs if exp_id in (0, run_number(run, stem))]:
             # A run that has no model yet is passed over, if it was not asked for
             if exp_id or (run / "best_model.zip").exists() or (run / f"{stem}.zip").exists():
                 return agent_at(run, which)
@@ -234,9 +240,3 @@ def agent_for(
         f"There is no trained agent for {wanted} in {folder}/: train one with `sb3-htr train --env {env_id} -f {folder}`. "
         f"The package comes with {', '.join(with_agent) or 'none'}."
     )
-
-
-def _number(run: Path, stem: str) -> int:
-    """Of a run folder, rl_zoo3's ``<stem>_<number>``, or with a unique id behind it; 0 for another folder."""
-    number = run.name.removeprefix(f"{stem}_").split("_")[0]
-    return int(number) if number.isdigit() else 0

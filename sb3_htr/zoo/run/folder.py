@@ -4,24 +4,34 @@ import os
 from pathlib import Path
 
 from filelock import FileLock, Timeout
-from rl_zoo3.utils import get_latest_run_id
 
 LOCK = ".lock"
 
 
-def claim(log_folder: str, env_id: str, suffix: str) -> Path:
+def run_number(run: Path, stem: str) -> int:
+    """
+    :param run: folder
+    :param stem: env of the run, in names of files
+    :return: of rl_zoo3's ``<stem>_<number>``, or with a unique id behind it; 0 for another folder
+    """
+    number = run.name.removeprefix(f"{stem}_").split("_")[0]
+    return int(number) if number.isdecimal() else 0
+
+
+def claim(log_folder: str, stem: str, suffix: str) -> Path:
     """
     :param log_folder: of all runs of a method
-    :param env_id: env of the run
+    :param stem: env of the run, in names of files
     :param suffix: behind the number of the run
-    :return: a new folder, ``<env_id>_<number><suffix>``, that no other process has, however many begin at once
+    :return: a new folder, ``<stem>_<number><suffix>``, that no other process has, however many begin at once
     """
-    number = get_latest_run_id(log_folder, env_id)
+    os.makedirs(log_folder, exist_ok=True)
+    number = max((run_number(path, stem) for path in Path(log_folder).iterdir() if path.name.startswith(stem)), default=0)
     while True:
         number += 1
-        folder = Path(log_folder, f"{env_id}_{number}{suffix}")
+        folder = Path(log_folder, f"{stem}_{number}{suffix}")
         try:
-            os.makedirs(folder)
+            folder.mkdir()
         except FileExistsError:
             continue
         return folder

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import shutil
 import signal
 import sys
 import threading
@@ -63,6 +64,7 @@ class MetaExperimentManager(ExperimentManager):
         self._method_name = method
         self._unique = kwargs.get("uuid_str", "")
         self.resumed = resumed
+        self._claimed: Path | None = None
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """
@@ -76,11 +78,18 @@ class MetaExperimentManager(ExperimentManager):
         given, trial_id = dict(self.custom_hyperparams or {}), self.trial_id
         self.custom_hyperparams, self.trial_id = None, None
         with redirect_stdout(StringIO()):  # it prints what is not all of it
-            hyperparams, _ = super().read_hyperparameters()
+            try:
+                hyperparams, _ = super().read_hyperparameters()
+            except (AttributeError, TypeError):
+                raise ValueError(
+                    f"{self.config} is no file of hyperparameters: expected ids of envs, with settings."
+                ) from None
         in_file = hyperparams.pop("method", DEFAULT)
         in_params = given.pop("method", in_file)
         self.method = get_method(self._method_name or in_params)
         hyperparams = merged(plain_settings(hyperparams, self.config, self.trust), self.method.hyperparams())
+        if self.resumed is not None:  # what a user gave comes from a file now
+            given = plain_settings(given, self.resumed / RECORD, self.trust)
         hyperparams = merged(merged(hyperparams, self._trial(trial_id)), given)
         saved = OrderedDict(sorted(hyperparams.items()))
         print(f"Method {self.method.name}: {self.config} has the settings of the env. With those of the command line:")
@@ -143,6 +152,17 @@ class MetaExperimentManager(ExperimentManager):
         )
         return env if self.vec_env_wrapper is None else self.vec_env_wrapper(env)
 
+    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
+        """
+        :return: the model and its hyperparameters; None for a search
+        """
+        try:
+            return super().setup_experiment()
+        except BaseException:
+            if self._claimed is not None:  # nothing was trained in it
+                shutil.rmtree(self._claimed)
+            raise
+
     def create_log_folder(self) -> None:
         """Make the run's folder, or take the one of the run that goes on; a search has none."""
         self.log_path = f"{self.log_folder}/{self.method.name}/"
@@ -153,8 +173,9 @@ class MetaExperimentManager(ExperimentManager):
         if self.resumed is None:
             # An env that cannot be trained on should say so before there is a folder
             make_task_vec_env(self.env_name.gym_id, env_kwargs=self.env_kwargs, wrapper=self.env_wrapper).close()
-            self.save_path = str(claim(self.log_path, self.env_name, self._unique))
-            self._lock = lock(Path(self.save_path))
+            self._claimed = claim(self.log_path, self.env_name, self._unique)
+            self.save_path = str(self._claimed)
+            self._lock = lock(self._claimed)
         else:
             self.save_path = str(self.resumed)
             self._lock = lock(self.resumed)
@@ -210,9 +231,11 @@ class MetaExperimentManager(ExperimentManager):
         try:
             super().save_trained_model(model)
         except WRITE_ERRORS as error:
+            again = f"`sb3-htr train --resume {self.save_path}` goes on from the last checkpoint"
+            if not checkpoints(Path(self.save_path)):
+                again = "train again, as there is no checkpoint either"
             raise OSError(
-                f"The last model could not be written to {self.save_path} ({reason(error)}): free some space, and "
-                f"`sb3-htr train --resume {self.save_path}` goes on from the last checkpoint."
+                f"The last model could not be written to {self.save_path} ({reason(error)}): mend that, and {again}."
             ) from error
 
     def objective(self, trial: optuna.Trial) -> float:
@@ -309,7 +332,7 @@ def run_rl_zoo(
             "CheckpointCallback": CheckpointCallback,
             "ProgressBarCallback": MetaProgressBarCallback,
         },
-        rl_zoo3.train: {"ExperimentManager": manager},
+        rl_zoo3.train: {"ExperimentManager": manager, "ALGOS": {"pearl": PEARL}},
     }
     for module, classes in replaced.items():
         vars(module).update(classes)

@@ -7,7 +7,7 @@ import yaml
 from huggingface_hub import EvalResult, ModelCardData
 
 from sb3_htr.adaptation.evaluation import AdaptationRecord
-from sb3_htr.zoo.run.agents import file_stem
+from sb3_htr.zoo.run.hub import model_name
 
 TAGS = (
     "deep-reinforcement-learning",
@@ -89,11 +89,15 @@ def model_card(record: dict[str, Any], scores: dict[str, AdaptationRecord], repo
     imports = "".join(f"import {package}  # registers the env\n" for package in record["gym_packages"] or ["htr_envs"])
     if env_id.startswith("HiddenGoal/") and not record["gym_packages"]:
         imports += f'htr_envs.hide_goal("{env_id.partition("/")[2]}")  # registers the family\n'
-    file = f"{file_stem(env_id)}.zip"
+    file = f"{model_name(env_id)}.zip"
+    watch = f"sb3-htr enjoy {file}"
     path = f'"{file}"'
     if repo_id is not None:
         imports += "from huggingface_hub import hf_hub_download\n"
         path = f'hf_hub_download("{repo_id}", {path})'
+        user, _, repo_name = repo_id.partition("/")
+        named = "" if repo_name == model_name(env_id) else f" -name {repo_name}"
+        watch = f"sb3-htr load_from_hub --env {env_id} -orga {user}{named}\n$ sb3-htr enjoy --env {env_id}"
     about = " with Hindsight Task Relabelling (Packer, Abbeel and Gonzalez, 2021)" if name.startswith("htr") else ""
     versions = ", ".join(f"{package} {version}" for package, version in record.get("versions", {}).items())
     return f"""---
@@ -117,7 +121,7 @@ paper.
 
 ```console
 $ pip install 'sb3_htr[zoo,video]'
-$ sb3-htr enjoy {file}
+$ {watch}
 ```
 
 ```python
@@ -127,7 +131,7 @@ import gymnasium
 
 model = PEARL.load({path})
 env = gymnasium.make("{env_id}"{kwargs})
-agent = model.adapt(env, n_episodes={min(n_episodes, 10)}, task=env.unwrapped.test_tasks[0])
+agent = model.adapt(env, n_episodes={min(n_episodes, 10)}, task=env.get_wrapper_attr("test_tasks")[0])
 print(agent.returns)  # of the adaptation episodes; agent.predict(observation) acts on this task
 ```
 

@@ -5,7 +5,7 @@ not, unless the user says ``--trust``.
 
 import ast
 import importlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,16 @@ IMPORTED = ("callback", "env_wrapper", "vec_env_wrapper", "replay_buffer_class")
 EVALUATED = ("policy_kwargs", "replay_buffer_kwargs", "monitor_kwargs")
 # Arguments of a training whose values rl_zoo3 evaluates as Python, key by key
 KEY_VALUES = ("-params", "--hyperparams", "--env-kwargs", "--eval-env-kwargs")
+CONF = ("-conf", "--conf-file")
+# Those that load no model, search or upload nothing. By their full names: an abbreviation could be one of any other
+HARMLESS = (
+    *KEY_VALUES,
+    *CONF,
+    *("--algo", "--env", "--gym-packages", "-n", "--n-timesteps", "--seed", "--num-threads", "--vec-env", "--device"),
+    *("-f", "--log-folder", "-tb", "--tensorboard-log", "--log-interval", "--verbose", "-P", "--progress", "-uuid", "--uuid"),
+    *("--eval-freq", "--eval-episodes", "--n-eval-envs", "--save-freq", "--save-replay-buffer"),
+    *("--storage", "--study-name", "--trial-id"),
+)
 
 
 def refuse(file: object, what: str) -> ValueError:
@@ -45,31 +55,48 @@ def plain_settings(hyperparams: dict[str, Any], file: object, trust: bool) -> di
         raise refuse(file, f"has policy: {hyperparams['policy']!r}")
     for key in EVALUATED:
         if isinstance(hyperparams.get(key), str):
-            try:
-                hyperparams[key] = ast.literal_eval(hyperparams[key])
-            except (ValueError, SyntaxError):
-                raise refuse(file, f"has {key}: {hyperparams[key]!r}") from None
+            if not _is_literal(hyperparams[key]):
+                raise refuse(file, f"has {key}: {hyperparams[key]!r}")
+            hyperparams[key] = ast.literal_eval(hyperparams[key])
     return hyperparams
 
 
-def check_arguments(arguments: Sequence[str], file: object, trust: bool) -> None:
+def check_arguments(arguments: Sequence[str], packages: Sequence[str], file: object, trust: bool) -> None:
     """
     :param arguments: of a training, from the record of a run
+    :param packages: modules that the record asks for, see :func:`import_packages`
     :param file: the record, for messages
     :param trust: whether it may have code run
     :raises ValueError: if code would be run
     """
     option = ""
-    for word in () if trust else arguments:
+    for word in () if trust else _one_by_one(arguments):
         if word.startswith("-") and not word[1:2].isdecimal():
             option = word
+            refused = word not in HARMLESS
         elif option in KEY_VALUES:
-            try:
-                ast.literal_eval(word.partition(":")[2])
-            except (ValueError, SyntaxError):
-                raise refuse(file, f"has the argument {word!r}") from None
-        elif option in ("-conf", "--conf-file") and Path(word).suffix not in (".yml", ".yaml"):
-            raise refuse(file, f"reads its settings from {word!r}")
+            refused = not _is_literal(word.partition(":")[2])
+        else:
+            refused = (option in CONF and Path(word).suffix not in (".yml", ".yaml")) or (
+                option == "--gym-packages" and word not in packages
+            )
+        if refused:
+            raise refuse(file, f"has the argument {word!r}")
+
+
+def _one_by_one(arguments: Sequence[str]) -> Iterator[str]:
+    """``--option=value`` as two words."""
+    for word in arguments:
+        option, equals, value = word.partition("=")
+        yield from (option, value) if equals and option.startswith("--") else (word,)
+
+
+def _is_literal(text: str) -> bool:
+    try:
+        ast.literal_eval(text)
+    except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
+        return False
+    return True
 
 
 def import_packages(named: Iterable[str], asked_for: Iterable[str] = (), file: object = "", trust: bool = False) -> None:

@@ -37,7 +37,7 @@ class Window:
         if surface is None:
             surface = display.set_mode(size)
             display.set_caption(self.title)
-        surface.blit(self.pygame.image.frombuffer(np.ascontiguousarray(frame), size, "RGB"), (0, 0))
+        surface.blit(self.pygame.image.frombuffer(frame.tobytes(), size, "RGB"), (0, 0))
         display.flip()
         self.clock.tick(self.fps)
         return not any(event.type == self.pygame.QUIT for event in self.pygame.event.get())

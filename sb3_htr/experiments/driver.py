@@ -1,0 +1,151 @@
+"""Runs the cells of an experiment on an executor: skips what is done, tries again what failed, waits for what others run."""
+
+import os
+import sys
+import time
+from collections import Counter
+from collections.abc import Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from datetime import timedelta
+from pathlib import Path
+
+from filelock import Timeout
+
+from sb3_htr.common.resume import n_steps_done
+from sb3_htr.experiments.cell import Cell
+from sb3_htr.experiments.runner import claim, run_cell
+
+# Failures of a cell without a new checkpoint in between, after which it is given up
+ATTEMPTS = 3
+# Seconds between two looks at the folder, and between two lines in a file; looks take at most a tenth of the time
+PERIOD, LINES = 5.0, 60.0
+
+
+class Driver:
+    """
+    Knows of the cells of an experiment what is in the folder of the runs, and no more: others may run them, too.
+
+    :param cells: of one experiment
+    :param runs: folder of all experiments' runs, which all nodes see under this name
+    :param executor: where cells run
+    """
+
+    def __init__(self, cells: Sequence[Cell], runs: Path, executor: Executor) -> None:
+        self.cells, self.runs, self.executor = cells, runs.resolve(), executor
+        self.failed: dict[str, str] = {}
+        self._futures: dict[Future[bool], Cell] = {}
+        self._failures: Counter[tuple[str, int]] = Counter()
+        self._start: tuple[float, int] | None = None
+        self._next_look = self._next_line = 0.0
+
+    def run(self) -> None:
+        """
+        Until there is a result of each cell, or a reason why there is none.
+
+        :raises ValueError: if cells failed, once all others are done
+        """
+        self.runs.mkdir(parents=True, exist_ok=True)
+        try:
+            while todo := self._look():
+                submitted = {cell.name for cell in self._futures.values()}
+                for cell in todo:
+                    if cell.name not in submitted and not self.is_claimed(cell):
+                        self._futures[self.executor.submit(run_cell, cell, self.runs)] = cell
+                self._wait()
+        except BaseException:
+            # Ctrl-C reaches what runs on this machine, too: it stops before its next rollout, with a checkpoint
+            self.executor.shutdown(wait=True, cancel_futures=True)
+            raise
+        self.executor.shutdown()
+        if self.failed:
+            reasons = " ".join(f"{name}: {reason}" for name, reason in self.failed.items())
+            raise ValueError(
+                f"{len(self.failed)} of {len(self.cells)} cells failed {ATTEMPTS} times (see log.txt in {self.runs}; "
+                f"the same command tries them again). {reasons}"
+            )
+
+    def todo(self) -> list[Cell]:
+        """
+        :return: cells that have no result, and were not given up
+        """
+        results = self._results()
+        return [cell for cell in self.cells if cell.result(self.runs).name not in results and cell.name not in self.failed]
+
+    def _results(self) -> set[str]:
+        """Names of result files. A listing is fresh where answers about single files may be remembered, as by NFS."""
+        folder = self.cells[0].result(self.runs).parent
+        return set(os.listdir(folder)) if folder.exists() else set()
+
+    def is_claimed(self, cell: Cell) -> bool:
+        """
+        :param cell: of the experiment
+        :return: whether a process runs it
+        """
+        if not cell.run_folder(self.runs).exists():
+            return False
+        try:
+            claim(cell, self.runs).acquire(timeout=0).lock.release()
+        except Timeout:
+            return True
+        return False
+
+    def n_steps(self, cell: Cell) -> int:
+        """
+        :param cell: of the experiment
+        :return: env steps before its latest checkpoint
+        """
+        return max((n_steps_done(run) for run in cell.run_folder(self.runs).glob("*/*")), default=0)
+
+    def line(self, todo: Sequence[Cell]) -> str:
+        """
+        :param todo: cells that have no result
+        :return: progress: done, running, time left. Env steps are what is counted, up to the latest checkpoints
+        """
+        total, now = sum(cell.n_timesteps for cell in self.cells), time.monotonic()
+        left = sum(cell.n_timesteps - self.n_steps(cell) for cell in todo)
+        start, before = self._start = self._start or (now, left)
+        n_running = sum(self.is_claimed(cell) for cell in todo)
+        parts = [f"{len(self.cells) - len(todo) - len(self.failed)} of {len(self.cells)} cells done", f"{n_running} running"]
+        parts += [f"{len(self.failed)} failed"] if self.failed else []
+        parts += [f"{100 * (total - left) // max(total, 1)} % of the env steps"]
+        if left < before:
+            parts += [f"{timedelta(seconds=round(left * (now - start) / (before - left)))} left"]
+        return ", ".join(parts)
+
+    def _look(self) -> list[Cell]:
+        start = time.monotonic()
+        todo = self.todo()
+        if start >= self._next_line or not todo:
+            print(self.line(todo), flush=True)
+            self._next_line = start + LINES
+        self._next_look = time.monotonic() + max(PERIOD, 10 * (time.monotonic() - start))
+        return todo
+
+    def _wait(self) -> None:
+        """Until nothing runs here, or it is time to look at what others did."""
+        while (timeout := self._next_look - time.monotonic()) > 0:
+            if not self._futures:
+                time.sleep(timeout)
+            for future in wait(self._futures, timeout, FIRST_COMPLETED).done:
+                self._end(self._futures.pop(future), future)
+                if not self._futures:
+                    return
+
+    def _end(self, cell: Cell, future: Future[bool]) -> None:
+        error = future.exception()
+        if isinstance(error, Exception):
+            # Ray's text is a traceback, with the error at its end
+            self._fail(cell, f"{type(error).__name__}: {error}".strip().splitlines()[-1])
+        elif error is not None:
+            raise error
+        elif future.result() and cell.result(self.runs).name not in self._results():
+            self._fail(cell, f"its node has a result that is not in {self.runs} here: give --runs that all nodes see.")
+
+    def _fail(self, cell: Cell, reason: str) -> None:
+        at = cell.name, self.n_steps(cell)
+        self._failures[at] += 1
+        given_up = self._failures[at] == ATTEMPTS
+        what = f"failed {ATTEMPTS} times" if given_up else "failed, and is tried again"
+        print(f"{cell.name} {what} at {at[1]:,} env steps: {reason}", file=sys.stderr, flush=True)
+        if given_up:
+            self.failed[cell.name] = reason

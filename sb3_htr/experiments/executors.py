@@ -1,0 +1,85 @@
+"""Where cells run. An executor is a ``concurrent.futures.Executor``, so those of Dask, MPI or submitit fit, too."""
+
+import os
+import socket
+from collections.abc import Callable
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from multiprocessing import get_context
+from typing import Any, TypeVar
+from urllib.parse import urlsplit
+
+T = TypeVar("T")
+
+
+class Here(Executor):
+    """Each call at once, in this process: for one cell, where something else sees to processes, as Slurm does."""
+
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        future: Future[T] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+class Processes(ThreadPoolExecutor):
+    """
+    Each call in a new process of this machine: one that is killed takes no other with it.
+
+    :param n: processes at a time, each with one thread
+    """
+
+    def __init__(self, n: int) -> None:
+        super().__init__(n)
+        # They get the environment of this one; torch and BLAS would take all cores each
+        os.environ["OMP_NUM_THREADS"] = "1"
+
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        return super().submit(_in_a_process, fn, *args, **kwargs)
+
+
+def _in_a_process(fn: Callable[..., T], *args: Any, **kwargs: Any) -> T:
+    with ProcessPoolExecutor(1, get_context("spawn")) as process:
+        return process.submit(fn, *args, **kwargs).result()
+
+
+class Ray(Executor):
+    """
+    Each call as a task of one CPU on a Ray cluster, in a worker process of its own. What fails is not tried again by Ray: the
+    driver does, and says so.
+
+    :param address: of the cluster's head, or ``"auto"``
+    :raises ConnectionError: if no cluster answers there
+    """
+
+    def __init__(self, address: str) -> None:
+        import ray
+
+        self._ray = ray
+        try:
+            if address != "auto":
+                # Ray waits for minutes where nobody answers
+                parts = urlsplit(address if "://" in address else f"//{address}")
+                socket.create_connection((parts.hostname or "", parts.port or 0), timeout=5).close()
+            ray.init(address, log_to_driver=False)
+        except (OSError, ValueError, RuntimeError) as error:
+            raise ConnectionError(
+                f"No Ray cluster answers at {address} ({error}): start one with `ray start --head`, or leave --ray away."
+            ) from None
+        self._call = ray.remote(num_cpus=1, max_calls=1, max_retries=0)(_call)
+
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        future: Future[T] = self._call.remote(fn, *args, **kwargs).future()
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """
+        :param wait: not used
+        :param cancel_futures: not used: what runs ends when the driver leaves the cluster
+        """
+        self._ray.shutdown()
+
+
+def _call(fn: Callable[..., T], *args: Any, **kwargs: Any) -> T:
+    return fn(*args, **kwargs)

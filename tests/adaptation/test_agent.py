@@ -1,0 +1,112 @@
+"""Agents that are adapted to one task: saved, and loaded without the model."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.evaluation import evaluate_policy
+from torch import nn
+
+from helpers import ENV_ID, MakePEARL, with_policy
+from helpers.bombs import bombs
+from sb3_htr import AdaptedAgent
+
+pytestmark = pytest.mark.filterwarnings("ignore:No reward was found")
+
+
+class Rescaled(gym.ActionWrapper[Any, Any, Any]):
+    """The same robot with actions in other units, which are float64."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.action_space = gym.spaces.Box(np.array([0.0, -30.0]), np.array([2.0, 50.0]), dtype=np.float64)
+
+    def action(self, action: Any) -> Any:
+        return (action - np.array([1.0, 10.0])) / np.array([1.0, 40.0])
+
+
+@pytest.mark.parametrize(
+    ("settings", "wrap"),
+    [({}, None), ({"normalize_observations": True, "net_arch": [12, 8], "activation_fn": nn.Tanh}, None), ({}, Rescaled)],
+)
+def test_a_saved_agent_acts_as_it_did(settings: dict[str, Any], wrap: Any, tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    env = gym.make(ENV_ID)
+    env = env if wrap is None else wrap(env)
+    model = tiny_pearl(env, policy_kwargs=with_policy(**settings), n_tasks_per_rollout=2).learn(240)
+    agent = model.adapt(env, n_episodes=2, task=0)
+    agent.save(tmp_path / "agent")
+    assert [path.name for path in tmp_path.iterdir()] == ["agent.pt"] and (tmp_path / "agent.pt").stat().st_size < 20_000
+    loaded = AdaptedAgent.load(tmp_path / "agent")
+    rng = np.random.default_rng(0)
+    for obs in (rng.normal(size=2).astype(np.float32), rng.normal(size=(100, 2)).astype(np.float32)):
+        ours, theirs = (each.predict(obs, deterministic=True)[0] for each in (loaded, agent))
+        np.testing.assert_array_equal(ours, theirs)
+        assert ours.dtype == theirs.dtype
+        th.manual_seed(0)
+        samples = [loaded.predict(obs)[0] for _ in range(2)]
+        assert (samples[0] != samples[1]).any()
+    np.testing.assert_array_equal(loaded.returns, agent.returns)
+    np.testing.assert_array_equal(loaded.successes, agent.successes)
+    scores = [evaluate_policy(each, env, n_eval_episodes=2, warn=False) for each in (loaded, agent)]
+    assert scores[0] == scores[1]
+    loaded.save(tmp_path / "again.pt")
+    again = AdaptedAgent.load(tmp_path / "again.pt")
+    np.testing.assert_array_equal(again.predict(obs, deterministic=True)[0], theirs)
+
+
+def test_an_actor_of_ones_own_is_refused(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    agent = tiny_pearl(policy_kwargs=with_policy(activation_fn=nn.Softsign)).adapt(gym.make(ENV_ID), n_episodes=1)
+    with pytest.raises(ValueError, match=r"Only SB3's Actor with one of the activations ReLU, .* can be saved alone"):
+        agent.save(tmp_path / "agent")
+    assert not list(tmp_path.iterdir())
+
+
+def change(state: dict[str, Any], *path: str, value: Any) -> dict[str, Any]:
+    """The same with something else in one place."""
+    first, *rest = path
+    return {**state, first: change(state[first], *rest, value=value) if rest else value}
+
+
+HUGE = th.zeros(()).expand(10**6, 10**6)
+BOX = {"low": th.zeros(2, 2), "high": th.ones(2, 2)}
+
+
+def test_agents_of_strangers_run_nothing_and_take_no_memory(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    path = tmp_path / "agent.pt"
+    tiny_pearl().adapt(gym.make(ENV_ID), n_episodes=1).save(path)
+    good = path.read_bytes()
+    state = th.load(path, weights_only=True)
+    hostile: list[Any] = [
+        [],
+        {},
+        change(state, "format", value=2),
+        change(state, "z", value=th.zeros(())),
+        change(state, "z", value=th.zeros(10**6)),
+        change(state, "z", value=HUGE),
+        change(state, "returns", value="evil"),
+        change(state, "policy", value=None),
+        change(state, "policy", "activation", value="Transformer"),
+        change(state, "policy", "observation_space", value=BOX),
+        change(state, "policy", "action_space", value={}),
+        change(state, "policy", "normalizer", value={}),
+        change(state, "policy", "actor", value={"latent_pi.evil.weight": th.zeros(1)}),
+        change(state, "policy", "actor", "latent_pi.0.weight", value=HUGE),
+        change(state, "policy", "actor", "latent_pi.0.weight", value=th.zeros(10**6)),
+        change(state, "policy", "actor", "latent_pi.2.weight", value=th.zeros(10**6)),
+        change(state, "policy", "actor", "mu.bias", value=3),
+    ]
+    contents = [good[: len(good) // 2], b"", *bombs(tmp_path / "fuse")]
+    for i, content in enumerate([*hostile, *contents]):
+        if isinstance(content, bytes):
+            path.write_bytes(content)
+        else:
+            th.save(content, path)
+        with pytest.raises(ValueError, match=r"agent\.pt is damaged, or no agent saved by AdaptedAgent\.save"):
+            AdaptedAgent.load(path)
+            raise AssertionError(f"file {i} was taken")
+    assert not (tmp_path / "fuse").exists()
+    with pytest.raises(FileNotFoundError):
+        AdaptedAgent.load(tmp_path / "absent")

@@ -1,0 +1,117 @@
+"""A grid on Ray: with a stand-in wherever this is run, and on a real cluster where Ray is installed."""
+
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch as th
+
+from sb3_htr.experiments.cell import Cell
+from sb3_htr.experiments.driver import Driver
+from sb3_htr.experiments.executors import Here, Ray
+from sb3_htr.experiments.grid import Experiment, Variant, by
+from sb3_htr.experiments.runner import find_finished, run_cell
+from sb3_htr.zoo.run.agents import RECORD
+
+SMALL: dict[str, Any] = {
+    "n_envs": 4,
+    "n_tasks_per_rollout": 4,
+    "n_episodes_per_task": 3,
+    "learning_starts": 240,
+    "gradient_steps": 20,
+    "meta_batch_size": 4,
+    "batch_size": 4,
+    "policy_kwargs": {"net_arch": [8], "encoder_arch": [8]},
+}
+
+
+def test_a_call_is_a_task_of_one_cpu_in_a_process_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is asked of Ray; it tries nothing again, because the driver does."""
+    asked: list[Any] = []
+
+    class Task:
+        def __init__(self, value: Any) -> None:
+            self.value = value
+
+        def future(self) -> Future[Any]:
+            future: Future[Any] = Future()
+            future.set_result(self.value)
+            return future
+
+    def remote(**options: Any) -> Callable[..., Any]:
+        asked.append(options)
+        return lambda call: SimpleNamespace(remote=lambda *args, **kwargs: Task(call(*args, **kwargs)))
+
+    def init(address: str, **_: Any) -> None:
+        asked.append(address)
+
+    ray = SimpleNamespace(init=init, remote=remote, shutdown=lambda: asked.append("shutdown"))
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    with Ray("auto") as executor:
+        assert executor.submit(divmod, 7, 2).result() == (3, 1)
+    assert asked == ["auto", {"num_cpus": 1, "max_calls": 1, "max_retries": 0}, "shutdown"]
+    with pytest.raises(ConnectionError, match=r"No Ray cluster answers at 127.0.0.1:1 .*: start one with `ray start --head`"):
+        Ray("127.0.0.1:1")
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Two raylets on loopback, with one CPU each."""
+    pytest.importorskip("ray")
+    monkeypatch.setenv("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    yield cluster
+    cluster.shutdown()
+
+
+def workers() -> list[int]:
+    """Processes that run a cell."""
+    names = {int(path.parent.name): path.read_bytes() for path in Path("/proc").glob("[0-9]*/cmdline") if path.exists()}
+    return [pid for pid, name in names.items() if name.startswith(b"ray::_call")]
+
+
+def test_a_worker_and_a_node_that_are_killed_cost_no_cell(cluster: Any, tmp_path: Path) -> None:
+    """Each cell has one result, and the weights of a run that nobody disturbed."""
+    evaluations = by(("prior",))
+    variant = Variant("htr-ser", "tiny", SMALL, {"n_test_tasks": 4})
+    cells = Experiment("grid", "", "SparsePointRobot-v0", 6000, (variant,), 4, 2000, evaluations).cells()
+    node = cluster.add_node(num_cpus=1)
+    runs, undisturbed = tmp_path / "runs", tmp_path / "undisturbed"
+    done: list[str] = []
+
+    def begun() -> list[Cell]:
+        return [cell for cell in cells if any(cell.run_folder(runs).rglob(RECORD)) and not cell.result(runs).exists()]
+
+    def kill() -> None:
+        while len(begun()) < 2:
+            time.sleep(0.1)
+        os.kill(workers()[0], signal.SIGKILL)
+        done.append("worker")
+        while len(begun()) < 2 or len(workers()) < 2:
+            time.sleep(0.1)
+        cluster.remove_node(node, allow_graceful=False)
+        done.append("node")
+
+    killer = threading.Thread(target=kill, daemon=True)
+    executor = Ray(cluster.address)
+    killer.start()
+    Driver(cells, runs, executor).run()
+    assert done == ["worker", "node"]
+    undisturbed.mkdir()
+    for cell in cells:
+        assert Here().submit(run_cell, cell, undisturbed).result()
+        ours, serial = (find_finished(cell, cell.run_folder(folder)) for folder in (runs, undisturbed))
+        assert len(list(cell.run_folder(runs).rglob("SparsePointRobot-v0.zip"))) == 1, "it was finished once"
+        assert ours is not None and serial is not None and cell.result(runs).exists()
+        weights = ours[1].policy.state_dict(), serial[1].policy.state_dict()
+        assert all(th.equal(weights[0][name], weights[1][name]) for name in weights[1])

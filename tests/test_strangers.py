@@ -1,0 +1,250 @@
+"""Files from strangers, made to run code, to take memory or to confuse: each is answered in one sentence, and runs nothing."""
+
+import hashlib
+import io
+import json
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch as th
+import yaml
+from stable_baselines3.common.utils import LinearSchedule
+
+from helpers import ENV_ID, MakePEARL
+from helpers.bombs import bombs
+from helpers.runs import make_run
+from sb3_htr import load_untrusted
+from sb3_htr.common.checkpoint import MANIFEST, DamagedCheckpoint, read_checkpoint, write_checkpoint
+from sb3_htr.common.resume import checkpoints
+from sb3_htr.zoo.cli import main
+from sb3_htr.zoo.run.agents import RECORD, agent_at
+
+
+@pytest.fixture
+def fuse(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file that appears if code of a stranger runs: of the module ``evil``, of :func:`code`, or of a pickle."""
+    (tmp_path / "evil.py").write_text(f"from pathlib import Path\nPath({str(tmp_path / 'fuse')!r}).touch()\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "evil", raising=False)
+    return tmp_path / "fuse"
+
+
+def code(fuse: Path) -> str:
+    return f"__import__('pathlib').Path({str(fuse)!r}).touch()"
+
+
+# --- run.json, the record of a run
+
+# What a stranger's record may change, as a function of the code that it would like to run
+RECORDS: dict[str, Callable[[str], dict[str, Any]]] = {
+    "its settings are Python": lambda code: {"arguments": ["-params", f"gamma:{code}"]},
+    "its settings are a string that is Python": lambda code: {"arguments": ["-params", f"policy_kwargs:{code!r}"]},
+    "its settings name a wrapper": lambda code: {"arguments": ["-params", "env_wrapper:'evil.X'"]},
+    "its settings name a callback": lambda code: {"arguments": ["-params", "callback:'evil.X'"]},
+    "its settings name a policy": lambda code: {"arguments": ["-params", "policy:'evil.X'"]},
+    "its env's arguments are Python": lambda code: {"arguments": ["--env-kwargs", f"goal_distance:{code}"]},
+    "an abbreviated option": lambda code: {"arguments": ["--hyperp", f"gamma:{code}"]},
+    "an abbreviated option with one dash": lambda code: {"arguments": ["-par", f"gamma:{code}"]},
+    "an option and its value in one word": lambda code: {"arguments": [f"--hyperparams=gamma:{code}"]},
+    "its settings are a module": lambda code: {"arguments": ["-conf", "evil"]},
+    "a model to begin with": lambda code: {"arguments": ["-i", "evil.zip"]},
+    "an upload": lambda code: {"arguments": ["--track"]},
+    "a search": lambda code: {"arguments": ["-optimize"]},
+    "packages among the arguments": lambda code: {"arguments": ["--gym-packages", "evil"]},
+    "packages": lambda code: {"gym_packages": ["evil"]},
+    "packages that are no list": lambda code: {"gym_packages": "evil"},
+    "arguments that are no list": lambda code: {"arguments": "-params"},
+    "arguments that are no text": lambda code: {"arguments": [1, None]},
+    "deep brackets": lambda code: {"arguments": ["-params", "gamma:" + "[" * 100_000]},
+    "deep signs": lambda code: {"arguments": ["-params", "gamma:" + "-" * 100_000 + "1"]},
+    "no number of steps": lambda code: {"n_timesteps": "many"},
+    "no method": lambda code: {"method": None},
+    "no seed": lambda code: {"seed": [1]},
+    "no hyperparameters": lambda code: {"hyperparams": None},
+    "an env of a module": lambda code: {"env_id": "evil:Env-v0", "arguments": ["--env", "evil:Env-v0"]},
+    "no env": lambda code: {"env_id": None},
+    "an env that there is not": lambda code: {"arguments": ["--env", "../../evil"]},
+}
+
+
+@pytest.mark.parametrize("change", RECORDS.values(), ids=RECORDS)
+def test_records(change: Callable[[str], dict[str, Any]], fuse: Path, tmp_path: Path, tiny_pearl: MakePEARL) -> None:
+    run = make_run(tmp_path / "logs", tiny_pearl())
+    write_checkpoint(run / "checkpoints" / "240_steps", {})
+    record = json.loads((run / RECORD).read_text())
+    changed = change(code(fuse))
+    if isinstance(changed.get("arguments"), list):
+        changed["arguments"] = ["--env", ENV_ID, *changed["arguments"]]
+    (run / RECORD).write_text(json.dumps({**record, **changed}))
+    # The second stops at a task that there is not, once it has done all that a record can ask for
+    for command in (["train", "--resume", str(run)], ["enjoy", str(run), "--no-render", "--task", "0"]):
+        with pytest.raises((ValueError, OSError)) as refusal:
+            main(command)
+        assert "\n" not in str(refusal.value)
+        assert not fuse.exists(), f"sb3-htr {command[0]} ran it"
+
+
+def test_modules_that_a_record_asks_for_are_imported_if_the_user_names_them(
+    fuse: Path, tmp_path: Path, tiny_pearl: MakePEARL
+) -> None:
+    run = make_run(tmp_path / "logs", tiny_pearl(), gym_packages=["evil"])
+    look = ["enjoy", str(run), "--no-render", "--n-episodes", "1", "--n-tasks", "1"]
+    with pytest.raises(
+        ValueError, match=r"best_model\.zip asks for the module 'evil'.* add --gym-packages evil if you know it"
+    ):
+        main(look)
+    assert not fuse.exists()
+    for said in (["--gym-packages", "evil"], ["--trust"]):
+        sys.modules.pop("evil", None)
+        assert main([*look, *said]) == 0
+        assert fuse.exists()
+        fuse.unlink()
+
+
+# --- YAML files
+
+BLOCK: dict[str, Any] = {"policy": "MlpPolicy", "n_timesteps": 100, "n_envs": 2}
+YAMLS: dict[str, Callable[[str], Any]] = {
+    "a callback with arguments": lambda code: {"callback": [{"subprocess.Popen": {"args": ["touch", "x"]}}]},
+    "a callback": lambda code: {"callback": "evil.X"},
+    "a wrapper": lambda code: {"env_wrapper": [{"evil.X": {}}]},
+    "a wrapper of the batch": lambda code: {"vec_env_wrapper": "evil.X"},
+    "a class of replay buffers": lambda code: {"replay_buffer_class": "evil.X"},
+    "a policy": lambda code: {"policy": "evil.X"},
+    "Python for the policy": lambda code: {"policy_kwargs": f"dict(x={code})"},
+    "Python for the replay buffer": lambda code: {"replay_buffer_kwargs": f"dict(x={code})"},
+    "Python for the monitor": lambda code: {"monitor_kwargs": code},
+    "Python to normalize by": lambda code: {"normalize": code},
+    "Python as a number": lambda code: {"gamma": code},
+    "Python as a schedule": lambda code: {"learning_rate": f"lin_{code}"},
+    "Python for the env": lambda code: {"env_kwargs": code},
+    "a class as text": lambda code: {"policy_kwargs": {"encoder_class": "evil.X"}},
+    "deep signs": lambda code: {"policy_kwargs": "-" * 100_000 + "1"},
+    "no settings": lambda code: [1, 2],
+    "a setting that is no text": lambda code: {1: 2},
+    "no number of envs": lambda code: {"n_envs": "many"},
+}
+
+
+@pytest.mark.parametrize("change", YAMLS.values(), ids=YAMLS)
+def test_yaml_files(change: Callable[[str], Any], fuse: Path, tmp_path: Path) -> None:
+    changed = change(code(fuse))
+    block = {**BLOCK, **changed} if isinstance(changed, dict) else changed
+    (tmp_path / "hostile.yml").write_text(yaml.safe_dump({ENV_ID: block}))
+    with pytest.raises((ValueError, TypeError)) as refusal:
+        main(["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(tmp_path / "hostile.yml")])
+    assert "\n" not in str(refusal.value)
+    assert not fuse.exists()
+
+
+# --- model files
+
+
+def plain(value: Any) -> bytes:
+    """As ``PEARL.save`` writes tensors."""
+    file = io.BytesIO()
+    th.save(value, file)
+    return file.getvalue()
+
+
+def expanded(weights: dict[str, Any]) -> dict[str, Any]:
+    """One number of the file for each tensor, of which torch makes as many as it likes."""
+    return {name: th.zeros(()).expand(tensor.shape) for name, tensor in weights.items()}
+
+
+def with_data(key: str, value: Any) -> Callable[[dict[str, Any], dict[str, Any]], dict[str, bytes]]:
+    return lambda data, weights: {"data": json.dumps({**data, key: value}).encode()}
+
+
+# Of the data and the weights of a model file, what a stranger may make
+MODELS: dict[str, Callable[[dict[str, Any], dict[str, Any]], dict[str, bytes]]] = {
+    **{
+        f"its {key} is {value!r:.20}": with_data(key, value)
+        for key, value in (
+            ("policy_kwargs", {"net_arch": [10**9]}),
+            ("policy_kwargs", {"net_arch": [2**14] * 10**4}),
+            ("policy_kwargs", {"net_arch": "evil"}),
+            ("policy_kwargs", {"latent_dim": -1}),
+            ("policy_kwargs", {"latent_dim": True}),
+            ("policy_kwargs", {"encoder_class": "evil.X"}),
+            ("policy_kwargs", [1]),
+            ("explorer", "evil.X"),
+            ("explorer", {"name": "evil.X"}),
+            ("explorer", {"name": "prior", "n_exploration_episodes": "evil"}),
+            ("explorer", None),
+            ("gamma", 7),
+            ("tau", -1),
+            ("learning_rate", {":type:": str(LinearSchedule), "start": "evil", "end": 0, "end_fraction": 1}),
+            ("learning_rate", {":type:": str(LinearSchedule)}),
+            ("meta_batch_size", 0.5),
+            ("replay_buffer_kwargs", {"relabeller": "evil.X"}),
+        )
+    },
+    "its data are no JSON": lambda data, weights: {"data": b"evil"},
+    "its data are a list": lambda data, weights: {"data": b"[]"},
+    "its data are deep brackets": lambda data, weights: {"data": b"[" * 100_000},
+    "its weights are no tensors": lambda data, weights: {"policy.pth": plain({name: "evil" for name in weights})},
+    "its weights are a list": lambda data, weights: {"policy.pth": plain([1])},
+    "its weights are named by numbers": lambda data, weights: {"policy.pth": plain(dict(enumerate(weights.values())))},
+    "its weights have other shapes": lambda data, weights: {
+        "policy.pth": plain({name: tensor.flatten()[:1] for name, tensor in weights.items()})
+    },
+    "its weights are larger than its file": lambda data, weights: {"policy.pth": plain(expanded(weights))},
+    "its knowledge is empty": lambda data, weights: {"knowledge.pth": plain({})},
+    "its knowledge is damaged": lambda data, weights: {"knowledge.pth": b"evil"},
+}
+
+
+@pytest.mark.parametrize("change", MODELS.values(), ids=MODELS)
+def test_model_files(
+    change: Callable[[dict[str, Any], dict[str, Any]], dict[str, bytes]], tmp_path: Path, tiny_pearl: MakePEARL
+) -> None:
+    tiny_pearl().save(tmp_path / "model.zip")
+    with zipfile.ZipFile(tmp_path / "model.zip") as source, zipfile.ZipFile(tmp_path / "hostile.zip", "w") as hostile:
+        data, weights = json.loads(source.read("data")), th.load(io.BytesIO(source.read("policy.pth")), weights_only=True)
+        changed = change(data, weights)
+        for name in source.namelist():
+            hostile.writestr(name, changed.get(name, source.read(name)))
+    with pytest.raises(ValueError) as refusal:
+        load_untrusted(tmp_path / "hostile.zip", ENV_ID)
+    assert "\n" not in str(refusal.value)
+
+
+# --- checkpoints
+
+
+def test_checkpoints(fuse: Path, tmp_path: Path) -> None:
+    for bomb in bombs(fuse):
+        folder = tmp_path / "1_steps"
+        write_checkpoint(folder, {})
+        (folder / "state.pt").write_bytes(bomb)
+        manifest = json.loads((folder / MANIFEST).read_text())
+        manifest["sha256"]["state.pt"] = hashlib.sha256(bomb).hexdigest()
+        (folder / MANIFEST).write_text(json.dumps(manifest))
+        with pytest.raises(DamagedCheckpoint, match=r"1_steps.* is not what sb3-htr writes"):
+            read_checkpoint(folder)
+    assert not fuse.exists()
+
+
+def test_names_that_are_no_numbers_are_no_checkpoints(tmp_path: Path) -> None:
+    for name in ("²_steps", "½_steps", "-1_steps", "x_steps", "_steps", "240_steps"):
+        (tmp_path / "checkpoints" / name).mkdir(parents=True)
+    assert [folder.name for folder in checkpoints(tmp_path)] == ["240_steps"]
+
+
+def test_manifests_of_brackets_are_damaged(tmp_path: Path) -> None:
+    write_checkpoint(tmp_path / "1_steps", {})
+    (tmp_path / "1_steps" / MANIFEST).write_text("[" * 100_000)
+    with pytest.raises(DamagedCheckpoint, match=r"1_steps has no readable manifest.json"):
+        read_checkpoint(tmp_path / "1_steps")
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", "null", '{"env_id": 1}', "[" * 100_000, "\x00\xff"])
+def test_damaged_records_are_named(content: str, tmp_path: Path) -> None:
+    (tmp_path / RECORD).write_text(content)
+    with pytest.raises(ValueError, match=r"run\.json is damaged, or no record of a run"):
+        agent_at(tmp_path)

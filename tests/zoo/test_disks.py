@@ -1,0 +1,131 @@
+"""A disk that fills up ends no training, and what was lost for want of it comes back."""
+
+import subprocess
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import load_results
+
+from helpers import ENV_ID, TINY, MakePEARL
+from helpers import parameters as parameters_of
+from helpers.disks import disk
+from helpers.runs import run_folder, train_arguments
+from sb3_htr import PEARL
+from sb3_htr.common.resume import CheckpointCallback, checkpoints
+from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.zoo.cli import main
+from sb3_htr.zoo.run.callbacks import ProgressCallback
+
+SETTINGS = ["--seed", "3", "--save-freq", "1", "--env-kwargs", "goal_distance:0.4", "n_validation_tasks:1"]
+
+
+def parameters(folder: Path) -> dict[str, th.Tensor]:
+    return parameters_of(PEARL.load(run_folder(folder) / f"{ENV_ID}.zip"))
+
+
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory: pytest.TempPathFactory) -> dict[str, th.Tensor]:
+    """What is learnt on a disk that is large enough."""
+    folder = tmp_path_factory.mktemp("unbroken")
+    assert main(train_arguments(folder, 960, *SETTINGS, eval_freq=480)) == 0
+    return parameters(folder)
+
+
+@pytest.mark.parametrize(
+    ("kilobytes", "lost"), [(20, "progress.csv"), (64, "best_model.zip"), (3000, "480_steps"), (8000, "720_steps")]
+)
+def test_a_disk_of_any_size(kilobytes: int, lost: str, unbroken: dict[str, th.Tensor], tmp_path: Path) -> None:
+    with disk(tmp_path, kilobytes) as folder, warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        try:
+            assert main(train_arguments(folder, 960, *SETTINGS, eval_freq=480)) == 0
+            refused = ""
+        except OSError as error:
+            refused = str(error)
+        assert any(lost in str(warning.message) and "Training goes on" in str(warning.message) for warning in said)
+        run = run_folder(folder)
+        assert (run / f"{ENV_ID}.zip").exists() == (not refused)
+        if refused:
+            assert refused.startswith(f"The last model could not be written to {run} (No space left on device)")
+            assert (f"--resume {run}" if checkpoints(run) else "train again") in refused
+        if checkpoints(run):
+            subprocess.run(["mount", "-o", "remount,size=40000k", str(folder)], check=True)
+            (run / f"{ENV_ID}.zip").unlink(missing_ok=True)
+            assert main(["train", "--resume", str(run)]) == 0
+            for name, values in parameters(folder).items():
+                assert th.equal(values, unbroken[name]), name
+
+
+class Then(BaseCallback):
+    """Does something when so many env steps are done."""
+
+    def __init__(self, steps: int, action: Callable[[], object]) -> None:
+        super().__init__()
+        self.steps, self.action = steps, action
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == self.steps:
+            self.action()
+        return True
+
+
+def test_a_monitor_file_without_room_ends_no_training(tmp_path: Path) -> None:
+    with disk(tmp_path, 8) as folder:
+        (folder / "filler").write_bytes(bytes(4096))
+        env = make_task_vec_env(ENV_ID, 4, monitor_dir=str(folder), env_kwargs={"max_episode_steps": 2})
+        free = Then(1200, (folder / "filler").unlink)
+        with pytest.warns(
+            UserWarning, match=r"monitor.csv could not be written \(No space left on device\). Training goes on"
+        ):
+            model = PEARL("MlpPolicy", env, **{**TINY, "gradient_steps": 1, "n_episodes_per_task": 50}).learn(
+                1600, callback=free
+            )
+        env.close()
+        assert model.num_timesteps == 1600
+        assert len(load_results(str(folder))) > 100
+
+
+def test_a_lost_progress_file_is_written_anew(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    path = tmp_path / "progress.csv"
+    progress = ProgressCallback(path)
+    checkpointing = CheckpointCallback(1, str(tmp_path), companions=[progress])
+    tiny_pearl().learn(5 * 240, callback=[checkpointing, progress, Then(600, path.unlink)])
+    rows = path.read_text().splitlines()
+    assert rows[0].count("time/total_timesteps") == 1
+    column = rows[0].split(",").index("time/total_timesteps")
+    assert [int(row.split(",")[column]) for row in rows[1:]] == [240, 480, 720, 960, 1200], "nothing of it is lost"
+    assert [folder.name for folder in checkpoints(tmp_path)] == ["1200_steps", "960_steps"]
+
+
+def test_an_old_checkpoint_that_cannot_be_removed_ends_no_training(
+    tiny_pearl: MakePEARL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import sb3_htr.common.resume as module
+
+    def refuse(path: Path) -> None:
+        raise PermissionError(1, "Operation not permitted", str(path))
+
+    monkeypatch.setattr(module.shutil, "rmtree", refuse)
+    with pytest.warns(UserWarning, match=r"old checkpoint .*240_steps could not be removed \(Operation not permitted\)"):
+        tiny_pearl().learn(4 * 240, callback=CheckpointCallback(1, str(tmp_path)))
+    assert len(checkpoints(tmp_path)) == 4
+
+
+@pytest.mark.parametrize("seconds", [0, -1e9, 5e9], ids=["1970", "1938", "2128"])
+def test_a_wrong_clock_ends_no_training(seconds: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """SB3's model files are zip files, which know no such time; checkpoints know none at all."""
+    with (
+        monkeypatch.context() as wrong,
+        pytest.warns(UserWarning, match=r"best_model.zip could not be written .*Training goes on"),
+    ):
+        wrong.setattr("time.time", lambda: seconds)
+        with pytest.raises(OSError, match=r"The last model could not be written .*: mend that, and `sb3-htr train --resume"):
+            main(train_arguments(tmp_path, 480, *SETTINGS, eval_freq=240))
+    run = run_folder(tmp_path)
+    assert [folder.name for folder in checkpoints(run)] == ["480_steps", "240_steps"]
+    assert main(["train", "--resume", str(run)]) == 0
+    assert PEARL.load(run / f"{ENV_ID}.zip").num_timesteps == 480
