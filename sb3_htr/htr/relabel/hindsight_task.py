@@ -68,7 +68,7 @@ class HindsightTaskStrategy(Enum):
 
 def solved_at_start(family: TaskFamily, first: Trajectory, tasks: np.ndarray) -> np.ndarray:
     """
-    Whether tasks are solved before anything was done: such an episode succeeds whatever it does, and teaches little.
+    Whether tasks are solved before anything was done. Hindsight teaches nothing of them: their real episodes are rewarded.
 
     A task is solved by the state that a step leads to. So the first state is seen as if a step had led to it. (What the first
     step led to would be another question: it may have solved a task that is one step away.)
