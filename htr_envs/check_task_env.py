@@ -359,7 +359,7 @@ def check_task_env(env: gym.Env[Any, Any], n_episodes: int = 3, seed: int = 0) -
     those of :class:`htr_envs.MetaEnv` and :class:`htr_envs.TaskDistribution`. Numbers are compared up to float32
     rounding. Run gymnasium's ``check_env`` as well: this function does not repeat it. The env is left without a given task.
 
-    :param env: the env, wrapped or not; wrappers must not change observations, actions or rewards.
+    :param env: the env with its time limit, wrapped or not; wrappers must not change observations, actions or rewards.
     :param n_episodes: number of random episodes to check.
     :param seed: seed of the first episode.
     :raises AssertionError: with one sentence on the broken promise.

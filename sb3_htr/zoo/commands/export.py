@@ -29,8 +29,8 @@ KEPT_OF_RECORD = ("env_id", "method", "env_kwargs", "gym_packages", "seed", "n_t
 def export(agent: TrainedAgent, path: Path, trust: bool = False) -> dict[str, Any]:
     """
     Write a model file without optimizer states, replay, statistics of training and local paths. ``PEARL.load`` reads it, and
-    the commands find in it which env it is for. Actor and encoder are exact; the critics, whose values only rank tasks, are kept
-    in half precision, and their targets are the same as they.
+    the commands find in it which env it is for. Actor and encoder are exact; the critics, whose values only rank tasks, are
+    kept in half precision, and their targets are the same as they.
 
     :param agent: to export
     :param path: file to write
