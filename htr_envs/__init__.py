@@ -5,6 +5,7 @@ from gymnasium.envs.registration import register
 from htr_envs.check_task_env import check_task_env
 from htr_envs.dynamics import Dynamics, DynamicsEnv, DynamicsVectorEnv
 from htr_envs.goal_env import HiddenGoalEnv, HiddenGoalFamily, hide_goal
+from htr_envs.meta_env import MetaEnv, TaskDistribution
 from htr_envs.point_robot import PointRobotEnv, PointRobotFamily, PointRobotVectorEnv
 from htr_envs.semicircle_goals import LocomotionFamily, SemicircleGoalFamily
 from htr_envs.target_speed import TargetSpeedEnv, TargetSpeedFamily, TargetSpeedVectorEnv
@@ -18,6 +19,7 @@ __all__ = [
     "HiddenGoalEnv",
     "HiddenGoalFamily",
     "LocomotionFamily",
+    "MetaEnv",
     "PointRobotEnv",
     "PointRobotFamily",
     "PointRobotVectorEnv",
@@ -25,6 +27,7 @@ __all__ = [
     "TargetSpeedEnv",
     "TargetSpeedFamily",
     "TargetSpeedVectorEnv",
+    "TaskDistribution",
     "TaskEnv",
     "TaskFamily",
     "TaskVectorEnv",

@@ -17,7 +17,9 @@ from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory
 MAX_STEPS = 200  # of an episode that are looked at
 N_DRAWS = 30
 TASK_SETS = ("train_tasks", "validation_tasks", "test_tasks")
-HOOKS = ("sample_tasks", "compute_reward", "is_success", "hindsight_task")
+# What tells the reward of a step under any task; a family of a MetaEnv has none of these
+REWARD_HOOKS = ("compute_reward", "is_success", "hindsight_task")
+INFO_KINDS = {"task_id": int, "is_success": bool, "achieved_task": np.ndarray, "task_free_reward": float}
 
 
 class Episode(NamedTuple):
@@ -53,16 +55,22 @@ def _select(traj: Trajectory, index: Any) -> Trajectory:
     return Trajectory(*(values[index] for values in traj))
 
 
+def _tells_rewards(family: Any) -> bool:
+    return any(hasattr(family, name) for name in REWARD_HOOKS)
+
+
 def _check_interface(env: gym.Env[Any, Any]) -> TaskFamily:
     base: Any = env.unwrapped
-    for name in ("task_family", "set_task", "compute_reward", "hindsight_task", *TASK_SETS, "task_space"):
-        _require(hasattr(base, name), f"The env has no `{name}`: derive it from htr_envs.TaskEnv.")
+    _require(hasattr(base, "task_family"), "The env has no `task_family`: derive it from htr_envs.TaskEnv.")
     family: TaskFamily = base.task_family
-    for name in (*HOOKS, *TASK_SETS, "task_space"):
+    hooks = REWARD_HOOKS if _tells_rewards(family) else ()
+    for name in ("set_task", *hooks[::2], *TASK_SETS, "task_space"):
+        _require(hasattr(base, name), f"The env has no `{name}`: derive it from htr_envs.TaskEnv.")
+    for name in ("sample_tasks", *hooks, *TASK_SETS, "task_space"):
         _require(hasattr(family, name), f"The task family has no `{name}`: derive it from htr_envs.TaskFamily.")
     for what, space in (("observation_space", env.observation_space), ("action_space", env.action_space)):
-        flat = isinstance(space, spaces.Box) and len(space.shape) == 1 and space.dtype == np.float32
-        _require(flat, f"The {what} must be a one-dimensional float32 Box.")
+        flat = isinstance(space, spaces.Box) and len(space.shape) == 1 and np.issubdtype(space.dtype, np.floating)
+        _require(flat, f"The {what} must be a one-dimensional Box of floats.")
     limited = any(env.has_wrapper_attr(name) for name in ("_max_episode_steps", "max_episode_steps"))
     limited = limited or (env.spec is not None and env.spec.max_episode_steps is not None)
     _require(limited, "The env has no time limit: register it with max_episode_steps, and pass gymnasium.make(id).")
@@ -97,15 +105,19 @@ def _check_family(family: TaskFamily) -> None:
 
 
 def _check_step(env: gym.Env[Any, Any], family: TaskFamily, observation: Any, reward: Any, info: dict[str, Any]) -> None:
-    float32 = isinstance(observation, np.ndarray) and observation.dtype == np.float32
+    typed = isinstance(observation, np.ndarray) and observation.dtype == env.observation_space.dtype
     _require(
-        float32 and observation in env.observation_space, "An observation is not float32 or not in the observation space."
+        typed and observation in env.observation_space, "An observation is not in the observation space, or of its dtype."
     )
     _require(np.isfinite(observation).all(), "An observation has a number that is not finite.")
     _require(isinstance(reward, float) and bool(np.isfinite(reward)), f"The reward {reward!r} is not a finite float.")
-    for key, kind in (("task_id", int), ("is_success", bool), ("achieved_task", np.ndarray), ("task_free_reward", float)):
+    told = _tells_rewards(family)
+    for key in INFO_KINDS if told else ("task_id",):
+        kind = INFO_KINDS[key]
         _require(key in info, f"The info of step lacks `{key}`.")
         _require(type(info[key]) is kind, f"info[{key!r}] is a {type(info[key]).__name__}, it must be a {kind.__name__}.")
+    if not told:
+        return
     _require(np.isfinite(info["task_free_reward"]), "info['task_free_reward'] is not finite.")
     _check_task_array(info["achieved_task"][None], family, "info['achieved_task'][None]")
 
@@ -130,15 +142,14 @@ def _play(
         next_observation, reward, terminated, truncated, info = env.step(action)
         _check_step(env, family, next_observation, reward, info)
         _require(info["task_id"] == task_id, f"The task changed within an episode, from {task_id} to {info['task_id']}.")
-        achieved_task = info["achieved_task"]
-        fresh = not rows or not np.shares_memory(achieved_task, rows[-1][-2])
+        free, success, achieved_task = (info.get(key) for key in ("task_free_reward", "is_success", "achieved_task"))
+        fresh = not rows or achieved_task is None or not np.shares_memory(achieved_task, rows[-1][-2])
         _require(fresh, "info['achieved_task'] is the same memory at each step: return a copy.")
-        free = info["task_free_reward"]
-        rows.append((observation, action, next_observation, free, reward, info["is_success"], achieved_task, terminated))
+        rows.append((observation, action, next_observation, free, reward, success, achieved_task, terminated))
         observation, done = next_observation, terminated or truncated
         after_step()
     columns = [np.array(column) for column in zip(*rows, strict=True)]
-    traj = Trajectory(columns[0], columns[1], columns[2], columns[3].astype(np.float32))
+    traj = Trajectory(*(column.astype(np.float32) for column in columns[:4]))
     return Episode(traj, columns[4].astype(np.float32), columns[5], columns[6], columns[7], task_id)
 
 
@@ -290,6 +301,18 @@ def _check_episode(env: gym.Env[Any, Any], family: TaskFamily, seed: int) -> Non
         _require(undisturbed, "Calling compute_reward or hindsight_task changes the env: the same episode went otherwise.")
 
 
+def _check_dependent_episode(env: gym.Env[Any, Any], family: TaskFamily, seed: int) -> None:
+    """Of a MetaEnv, in which all but the first observation may depend on the task."""
+    plain, other = (_play(env, family, seed, task) for task in (family.train_tasks[0], family.test_tasks[0]))
+    again = _play(env, family, seed, family.train_tasks[0], plain.traj.actions)
+    same = all(
+        map(_same, (plain.rewards, plain.terminated, *plain.traj[:3]), (again.rewards, again.terminated, *again.traj[:3]))
+    )
+    _require(same, "The same seed, task and actions gave another episode: use no other randomness than self.np_random.")
+    same_start = _same(plain.traj.observations[0], other.traj.observations[0])
+    _require(same_start, "The task leaks into the first observation: same seed, another task, another one.")
+
+
 def _check_task_rules(env: gym.Env[Any, Any], family: TaskFamily) -> None:
     base: Any = env.unwrapped
     n_tasks = len(family.train_tasks)
@@ -332,18 +355,20 @@ def _check_bad_options(env: gym.Env[Any, Any], family: TaskFamily) -> None:
 def check_task_env(env: gym.Env[Any, Any], n_episodes: int = 3, seed: int = 0) -> None:
     """Run random episodes and fail at the first promise of a task family that the env breaks.
 
-    The promises are those of :class:`htr_envs.TaskEnv` and :class:`htr_envs.TaskFamily`. Numbers are compared up to float32
+    The promises are those of :class:`htr_envs.TaskEnv` and :class:`htr_envs.TaskFamily`, or, where the family has no rewards,
+    those of :class:`htr_envs.MetaEnv` and :class:`htr_envs.TaskDistribution`. Numbers are compared up to float32
     rounding. Run gymnasium's ``check_env`` as well: this function does not repeat it. The env is left without a given task.
 
-    :param env: the env, wrapped or not; wrappers must not change observations, actions or rewards.
+    :param env: the env with its time limit, wrapped or not; wrappers must not change observations, actions or rewards.
     :param n_episodes: number of random episodes to check.
     :param seed: seed of the first episode.
     :raises AssertionError: with one sentence on the broken promise.
     """
     family = _check_interface(env)
     _check_family(family)
+    check_episode = _check_episode if _tells_rewards(family) else _check_dependent_episode
     for episode in range(n_episodes):
-        _check_episode(env, family, seed + episode)
+        check_episode(env, family, seed + episode)
     _check_task_rules(env, family)
     _check_bad_options(env, family)
     env.unwrapped.set_task(None)  # type: ignore[attr-defined]

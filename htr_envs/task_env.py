@@ -8,16 +8,14 @@ task, long after the environment has moved on: the family is a small object that
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
-from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
-FloatArray = NDArray[np.float32]
+from htr_envs.meta_env import FloatArray, MetaEnv, TaskDistribution
+
 BoolArray = NDArray[np.bool_]
 
 REWARD_TYPES = ("sparse", "dense")
@@ -112,7 +110,7 @@ def draw_task_sets(
     return train, draw(n_validation_tasks, 1), draw(n_test_tasks, 2)
 
 
-class TaskFamily(ABC):
+class TaskFamily(TaskDistribution):
     """A distribution of tasks with their rewards: small, picklable, stateless.
 
     All methods are pure and vectorized: they change neither their arguments nor the family, and leading axes of the
@@ -124,50 +122,6 @@ class TaskFamily(ABC):
     :param test_tasks: tasks to report results on, shape (n, task_dim).
     :raises ValueError: if an array has the wrong shape, leaves ``task_space``, or shares a task with another.
     """
-
-    def __init__(
-        self, task_space: spaces.Box, train_tasks: ArrayLike, validation_tasks: ArrayLike, test_tasks: ArrayLike
-    ) -> None:
-        self.task_space = task_space
-        self.train_tasks: FloatArray = np.array(train_tasks, dtype=np.float32)
-        self.validation_tasks: FloatArray = np.array(validation_tasks, dtype=np.float32)
-        self.test_tasks: FloatArray = np.array(test_tasks, dtype=np.float32)
-        self._freeze()
-        seen: set[bytes] = set()
-        for name, tasks in self._task_sets().items():
-            if tasks.ndim != 2 or len(tasks) == 0:
-                raise ValueError(f"{name} has shape {tasks.shape}, expected (n, task_dim): pass at least one task.")
-            if not all(task_space.contains(task) for task in tasks):
-                raise ValueError(f"{name} holds a task that is not in {task_space}: widen the space or move it.")
-            # adding 0.0 turns -0.0 into 0.0, the same task with other bytes
-            keys = {(task + 0.0).tobytes() for task in tasks}
-            if keys & seen:
-                raise ValueError(f"{name} shares a task with another set: train, validation and test tasks must be disjoint.")
-            seen |= keys
-
-    def _task_sets(self) -> dict[str, FloatArray]:
-        return {
-            "train_tasks": self.train_tasks,
-            "validation_tasks": self.validation_tasks,
-            "test_tasks": self.test_tasks,
-        }
-
-    def _freeze(self) -> None:
-        for tasks in self._task_sets().values():
-            tasks.setflags(write=False)
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._freeze()  # pickling forgets that an array is read-only
-
-    @abstractmethod
-    def sample_tasks(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Draw new tasks from the distribution that the fixed task sets stand for.
-
-        :param n: how many tasks.
-        :param rng: the only source of randomness.
-        :return: tasks, shape (n, task_dim).
-        """
 
     @abstractmethod
     def compute_reward(self, traj: Trajectory, task: ArrayLike, reward_type: str = "sparse") -> FloatArray:
@@ -199,71 +153,14 @@ class TaskFamily(ABC):
         :return: tasks in ``task_space``, shape (..., task_dim), float32, sharing no memory with ``traj``.
         """
 
-    def task_vectors(self, tasks: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
-        """Check task vectors that a user gave and copy them.
 
-        :param tasks: one task or several.
-        :param shape: the shape that they must have, (..., task_dim).
-        :return: the tasks, float32.
-        :raises ValueError: if they are not numbers, have another shape, or lie outside ``task_space``.
-        """
-        try:
-            vectors = np.array(tasks, dtype=np.float32)
-        except (TypeError, ValueError):
-            raise ValueError(f"The task {tasks!r} is not made of numbers: pass a float vector of shape {shape}.") from None
-        if vectors.shape != shape:
-            raise ValueError(f"The task has shape {vectors.shape}, expected {shape}: pass a vector of the task space.")
-        # written so that nan, which compares with nothing, is refused too
-        if not np.all((vectors >= self.task_space.low) & (vectors <= self.task_space.high)):
-            raise ValueError(f"The task {vectors.tolist()} is not in {self.task_space}: pass a vector of the task space.")
-        return vectors
-
-    def task_indices(self, ids: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.int64]:
-        """Check ids of training tasks that a user gave and copy them.
-
-        :param ids: one id or several, indices into ``train_tasks``.
-        :param shape: the shape that they must have.
-        :return: the ids, int64.
-        :raises ValueError: if they are no integers, have another shape, or are out of range.
-        """
-        indices = np.asarray(ids)
-        n = len(self.train_tasks)
-        if not np.issubdtype(indices.dtype, np.integer):
-            raise ValueError(f"The task id {ids!r} is no integer: pass an index into train_tasks, from 0 to {n - 1}.")
-        if indices.shape != shape:
-            raise ValueError(f"The task id has shape {indices.shape}, expected {shape}: pass one id for each env.")
-        if np.any((indices < 0) | (indices >= n)):
-            raise ValueError(f"The task id {ids!r} is out of range: there are {n} training tasks, so pass 0 to {n - 1}.")
-        return indices.astype(np.int64)
-
-
-def task_from_options(options: dict[str, Any] | None) -> tuple[str, Any] | None:
-    """Read the options of a reset.
-
-    :param options: ``{"task_id": ...}``, ``{"task": ...}``, or nothing.
-    :return: the key and its value, or None where no task is given.
-    :raises ValueError: if there is an unknown key, or more than one.
-    """
-    if not options:
-        return None
-    unknown = sorted(str(key) for key in options if key not in ("task_id", "task"))
-    if unknown:
-        raise ValueError(f"Unknown reset options {unknown}: only 'task_id' and 'task' exist, remove the others.")
-    if len(options) > 1:
-        raise ValueError("The reset options hold both 'task_id' and 'task': pass only one of them.")
-    return next(iter(options.items()))
-
-
-class TaskEnv(gym.Env[FloatArray, FloatArray], ABC):
+class TaskEnv(MetaEnv):
     """An environment whose reward depends on a task that the observation never shows.
 
     A subclass sets ``observation_space`` and ``action_space`` and writes the dynamics in ``_reset_state`` and ``_step_state``;
     tasks, rewards and infos are done here. The dynamics, terminations included, must not depend on the task.
 
-    The task of an episode is chosen at its reset. A task once given, by ``set_task`` or by the reset's options, stays over
-    later resets until it is changed; an env that was given none draws a random training task at each reset.
-
-    The info of ``reset`` has ``task_id``. The info of ``step`` has
+    Tasks are chosen as in :class:`MetaEnv`. The info of ``reset`` has ``task_id``. The info of ``step`` has
 
     - ``task_id``: int, index into ``train_tasks``, -1 for a task given as a vector;
     - ``is_success``: bool, whether this step solves the task;
@@ -275,23 +172,12 @@ class TaskEnv(gym.Env[FloatArray, FloatArray], ABC):
     :raises ValueError: if the reward type is unknown.
     """
 
-    observation_space: spaces.Box  # type: ignore[assignment]
-    action_space: spaces.Box  # type: ignore[assignment]
+    task_family: TaskFamily
 
     def __init__(self, task_family: TaskFamily, reward_type: str = "sparse") -> None:
         check_reward_type(reward_type)
-        self.task_family = task_family
+        super().__init__(task_family)
         self.reward_type = reward_type
-        self._given: tuple[int, FloatArray] | None = None
-        self._current: tuple[int, FloatArray] | None = None
-        self._observation: FloatArray | None = None
-
-    @abstractmethod
-    def _reset_state(self) -> FloatArray:
-        """Put the dynamics in a start state, drawn with ``self.np_random``.
-
-        :return: first observation, shape (obs_dim,), float32.
-        """
 
     @abstractmethod
     def _step_state(self, action: FloatArray) -> tuple[FloatArray, float, bool]:
@@ -301,45 +187,6 @@ class TaskEnv(gym.Env[FloatArray, FloatArray], ABC):
         :return: next observation (obs_dim,), task-free reward, whether the episode terminates.
         """
 
-    def set_task(self, task: ArrayLike | None) -> None:
-        """Choose the task of the episodes from the next reset on.
-
-        :param task: an index into ``train_tasks``, a vector of ``task_space``, or None to draw a training task at each reset.
-        :raises ValueError: if the id is out of range or the vector is not in the task space.
-        """
-        if task is None:
-            self._given = None
-        elif np.ndim(task) == 0:
-            self._give("task_id", task)
-        else:
-            self._give("task", task)
-
-    def _give(self, key: str, value: Any) -> None:
-        if key == "task_id":
-            task_id = int(self.task_family.task_indices(value, ()))
-            self._given = (task_id, self.train_tasks[task_id])
-        else:
-            assert self.task_space.shape is not None
-            self._given = (-1, self.task_family.task_vectors(value, self.task_space.shape))
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[FloatArray, dict[str, Any]]:
-        """Start an episode.
-
-        :param seed: seed of the env's generator, None to go on with it.
-        :param options: ``{"task_id": i}`` (index into ``train_tasks``) or ``{"task": vector}``; like ``set_task`` before.
-        :return: first observation (obs_dim,), float32, and an info with ``task_id``.
-        :raises ValueError: if an option is unknown or its task is invalid.
-        """
-        chosen = task_from_options(options)
-        super().reset(seed=seed)
-        if chosen is not None:
-            self._give(*chosen)
-        # drawn even if it is not used: a seed then gives the same starts whichever way the task was chosen
-        drawn = int(self.np_random.integers(len(self.train_tasks)))
-        self._current = (drawn, self.train_tasks[drawn]) if self._given is None else self._given
-        self._observation = np.array(self._reset_state(), dtype=np.float32)
-        return self._observation.copy(), {"task_id": self.task_id}
-
     def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
         """Do one step; the time limit is left to the TimeLimit wrapper.
 
@@ -348,16 +195,12 @@ class TaskEnv(gym.Env[FloatArray, FloatArray], ABC):
         :raises ValueError: if the action has the wrong shape.
         :raises gymnasium.error.ResetNeeded: before the first reset.
         """
-        if self._observation is None:
-            raise ResetNeeded("step was called before the first reset: call env.reset() first.")
-        action = np.array(action, dtype=np.float32)
-        if action.shape != self.action_space.shape:
-            raise ValueError(f"The action has shape {action.shape}, expected {self.action_space.shape}: pass one action.")
-        state, task_free_reward, terminated = self._step_state(action)
-        observation = np.array(state, dtype=np.float32)
+        before = self._observation
+        action, observation, task_free_reward, terminated = self._checked_step(action)
+        after = self._observation
+        assert before is not None and after is not None
         # one reward function for step and for relabelling: compute_reward gives step's rewards again, bit for bit
-        traj = Trajectory(self._observation[None], action[None], observation[None], np.array([task_free_reward], np.float32))
-        self._observation = observation
+        traj = Trajectory(before[None], action[None], after[None], np.array([task_free_reward], np.float32))
         reward = float(self.compute_reward(traj, self.task)[0])
         info = {
             "task_id": self.task_id,
@@ -365,7 +208,7 @@ class TaskEnv(gym.Env[FloatArray, FloatArray], ABC):
             "achieved_task": self.hindsight_task(traj, 0),
             "task_free_reward": float(traj.task_free_reward[0]),
         }
-        return observation.copy(), reward, bool(terminated), False, info
+        return observation, reward, bool(terminated), False, info
 
     def compute_reward(self, traj: Trajectory, task: ArrayLike, reward_type: str | None = None) -> FloatArray:
         """Reward of every step of a trajectory under a task; see :meth:`TaskFamily.compute_reward`.
@@ -386,38 +229,3 @@ class TaskEnv(gym.Env[FloatArray, FloatArray], ABC):
         :return: tasks, shape (..., task_dim), float32.
         """
         return self.task_family.hindsight_task(traj, index)
-
-    def _current_task(self) -> tuple[int, FloatArray]:
-        if self._current is None:
-            raise ResetNeeded("The env has no task before its first reset: call env.reset() first.")
-        return self._current
-
-    @property
-    def task(self) -> FloatArray:
-        """Task of the current episode, shape (task_dim,), a copy."""
-        return self._current_task()[1].copy()
-
-    @property
-    def task_id(self) -> int:
-        """Index of the current episode's task in ``train_tasks``, -1 for a task given as a vector."""
-        return self._current_task()[0]
-
-    @property
-    def task_space(self) -> spaces.Box:
-        """The box that every task lies in."""
-        return self.task_family.task_space
-
-    @property
-    def train_tasks(self) -> FloatArray:
-        """Tasks to meta-train on, shape (n, task_dim), read-only."""
-        return self.task_family.train_tasks
-
-    @property
-    def validation_tasks(self) -> FloatArray:
-        """Tasks to choose hyper-parameters and checkpoints on, shape (n, task_dim), read-only."""
-        return self.task_family.validation_tasks
-
-    @property
-    def test_tasks(self) -> FloatArray:
-        """Tasks to report results on, shape (n, task_dim), read-only."""
-        return self.task_family.test_tasks

@@ -12,7 +12,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, check_reward_type, task_from_options
+from htr_envs.meta_env import task_from_options
+from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, check_reward_type
 
 
 class TaskVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]], ABC):

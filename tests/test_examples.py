@@ -20,18 +20,46 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 FAMILIES = {"two_link_arm": "TwoLinkArm-v0", "hidden_target_reacher": "HiddenTargetReacher-v0"}
 
 
-@pytest.mark.parametrize("module", FAMILIES)
-def test_a_family_of_the_examples_is_one(module: str) -> None:
+DEPENDENT = {"half_cheetah_velocity": "HalfCheetahVelocity-v0", "walker_random_params": "WalkerRandomParams-v0"}
+
+
+def import_example(module: str) -> None:
+    """With what it imports as a script, before it trains for minutes."""
     example = importlib.import_module(f"examples.{module}")
-    # What it imports as a script, before it trains for minutes
     for node in ast.walk(ast.parse(inspect.getsource(example))):
         if isinstance(node, ast.ImportFrom):
             assert all(hasattr(importlib.import_module(node.module or ""), name.name) for name in node.names), node.module
+
+
+@pytest.mark.parametrize("module", FAMILIES)
+def test_a_family_of_the_examples_is_one(module: str) -> None:
+    import_example(module)
     env = gym.make(FAMILIES[module])
     check_task_env(env)
     kwargs = {**TINY, "policy_kwargs": with_policy(normalize_observations=True)}
     model = PEARL("MlpPolicy", env, **kwargs, train_explorer="prior").learn(1)
     assert model.replay_buffer is not None and model.replay_buffer.size() > 0
+
+
+@pytest.mark.parametrize("module", DEPENDENT)
+def test_an_env_of_the_examples_whose_tasks_change_anything(module: str) -> None:
+    import_example(module)
+    env = gym.make(DEPENDENT[module])
+    check_task_env(env, n_episodes=1)
+    push = np.full(6, 0.3, dtype=np.float32)
+    steps = []
+    for task in (0, 1, 0):
+        env.reset(seed=0, options={"task_id": task})
+        steps.append([env.step(push)[:2] for _ in range(5)])
+    first, other, again = ([np.append(obs, float(reward)) for obs, reward in episode] for episode in steps)
+    np.testing.assert_array_equal(first, again)
+    assert not np.allclose(np.array(first)[:, -1], np.array(other)[:, -1])
+    moves_alike = np.allclose(np.array(first)[:, :-1], np.array(other)[:, :-1])
+    assert moves_alike == (module == "half_cheetah_velocity")
+    prior = {"name": "prior", "n_exploration_episodes": 1}
+    plain = {"replay_buffer_kwargs": {"relabel_probability": 0.0}, "explorer": prior, "train_explorer": prior}
+    model = PEARL("MlpPolicy", env, **{**TINY, **plain, "n_tasks_per_rollout": 1}).learn(1)
+    assert model.observation_space.dtype == np.float32 and model.replay_buffer is not None and model.replay_buffer.size() > 0
 
 
 def test_pictures_of_the_reacher_show_its_target() -> None:

@@ -47,8 +47,10 @@ class AdaptationRecord(NamedTuple):
     What happened in the adaptation episodes of some tasks.
 
     :param returns: (n_tasks, n_episodes) float64, undiscounted returns as the env gave them
-    :param successes: (n_tasks, n_episodes) bool, whether some step of the episode solved the task
-    :param achieved: (n_tasks, n_episodes, T, task_dim) float32, the task that each step achieved, NaN after an episode's end
+    :param successes: (n_tasks, n_episodes) bool, whether some step of the episode solved the task; never, if the env does not
+        tell (``info["is_success"]``)
+    :param achieved: (n_tasks, n_episodes, T, task_dim) float32, the task that each step achieved, NaN after an episode's end;
+        task_dim is 0 if the env does not tell (``info["achieved_task"]``)
     """
 
     returns: np.ndarray
@@ -80,8 +82,8 @@ def run_adaptation(
         # Envs that are ahead of the others write to a column that is cut off
         column = np.minimum(episode, n_episodes)
         returns[envs, column] += step.rewards
-        successes[envs, column] |= [info["is_success"] for info in step.infos]
-        steps.append(np.array([info["achieved_task"] for info in step.infos], dtype=np.float32))
+        successes[envs, column] |= [info.get("is_success", False) for info in step.infos]
+        steps.append(np.array([info.get("achieved_task", ()) for info in step.infos], dtype=np.float32))
         episode_of_step.append(column)
         episode += step.dones
     achieved = _by_episode(np.stack(steps, axis=1), np.stack(episode_of_step, axis=1), n_episodes)

@@ -15,6 +15,8 @@ from sb3_htr.common.type_aliases import Context
 UNREWARDED, REWARDED = 0.999, 0.001
 # Networks see the tasks of a bank as so many, or twice as many, and so on: of each new shape, oneDNN keeps something for good
 BLOCK = 64
+# Before anything is known, above 0 and below what a success is worth where it is worth 1
+INITIAL_THRESHOLD = 0.5
 
 
 class Particles(NamedTuple):
@@ -64,13 +66,25 @@ class LatentKnowledge(nn.Module):
         self.register_buffer("mean", th.zeros(latent_dim))
         self.register_buffer("cholesky", th.eye(latent_dim))
         # Above it, what a step returned beside the task-free part is a reward of the task
-        self.register_buffer("threshold", th.tensor(0.5))
+        self.register_buffer("threshold", th.tensor(INITIAL_THRESHOLD))
         # Discounted sum of what unrewarded steps return, forever
         self.register_buffer("task_free_value", th.zeros(()))
         self.register_buffer("n_particles", th.zeros((), dtype=th.int64))
         for name, shape in (("z", (n, latent_dim)), ("gain", (n, n)), ("returns", (n, n)), ("log_prior", (n,))):
             self.register_buffer(name, th.zeros(shape))
         self.register_buffer("is_train", th.zeros(n, dtype=th.bool))
+
+    @property
+    def tells_success(self) -> bool:
+        """Whether some rewards tell a success. In a family that has no successes, none does: the threshold is infinite."""
+        return bool(self.threshold < float("inf"))
+
+    def set_tells_success(self, tells_success: bool) -> None:
+        """
+        :param tells_success: whether the task family has successes
+        """
+        if tells_success != self.tells_success:
+            self.threshold.fill_(INITIAL_THRESHOLD if tells_success else float("inf"))
 
     def learn(self, policy: ContextualPolicy, means: th.Tensor, bank: TaskBank, gamma: float) -> None:
         """

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 
+from sb3_htr.common.checks import missing_hook
 from sb3_htr.common.random_state import get_generator_state, set_generator_state
 from sb3_htr.common.task_reward import ROUNDING
 from sb3_htr.common.type_aliases import TaskFamily
@@ -46,7 +47,7 @@ class TaskBank:
 
     It is hindsight relabelling once more: each new episode is rewarded under all these tasks. A state that solves none of the
     hindsight tasks becomes one, so that they are as far apart as a task reaches, whatever tasks are. What it keeps of an
-    episode is what its context would be.
+    episode is what its context would be. Where the family tells no successes, the bank stays empty.
 
     :param task_family: reward hook and training tasks
     :param transitions: columns of an episode's rows
@@ -85,6 +86,8 @@ class TaskBank:
     def update(self) -> None:
         """Take in the new episodes."""
         new, self.new = [episode for _, episode in self.new], []
+        if missing_hook(self.task_family) is not None:
+            return
         for start in range(0, len(new), CHUNK):
             chunk = new[start : start + CHUNK]
             length = np.array([len(episode) for episode in chunk])

@@ -42,7 +42,10 @@ def check_spaces(env: VecEnv) -> None:
     """
     for name, space in (("observation", env.observation_space), ("action", env.action_space)):
         if not isinstance(space, spaces.Box) or len(space.shape) != 1:
-            raise ValueError(f"The {name} space is {space}, but PEARL needs a Box of one axis: flatten it with a wrapper.")
+            raise ValueError(
+                f"The {name} space is {space}, but PEARL needs a Box of one axis: flatten it with a wrapper, hide the goal of "
+                "a GoalEnv with htr_envs.hide_goal, and put images through an encoder of your own."
+            )
 
 
 def check_numbers(**numbers: tuple[Any, float, float]) -> None:
@@ -112,10 +115,30 @@ def get_task_family(env: VecEnv) -> TaskFamily:
     """
     check_has_task_family(env.has_attr("task_family"))
     family: TaskFamily = env.get_attr("task_family")[0]
-    for name in ("compute_reward", "is_success", "hindsight_task", "train_tasks"):
-        if not hasattr(family, name):
-            raise ValueError(f"The env's task_family has no {name}, which hindsight relabelling needs: {TASK_ENV_ADVICE}.")
+    if not hasattr(family, "train_tasks"):
+        raise ValueError(f"The env's task_family has no train_tasks to meta-train on: {TASK_ENV_ADVICE}.")
     return family
+
+
+def missing_hook(family: TaskFamily) -> str | None:
+    """
+    :param family: of an env
+    :return: what it lacks for telling rewards and successes of any step under any task; None if nothing
+    """
+    return next((name for name in ("compute_reward", "is_success", "hindsight_task") if not hasattr(family, name)), None)
+
+
+def check_has_hooks(family: TaskFamily) -> None:
+    """
+    :param family: of an env
+    :raises ValueError: if it cannot tell rewards and successes of any step under any task
+    """
+    if (missing := missing_hook(family)) is not None:
+        raise ValueError(
+            f"The env's task_family has no {missing}, which hindsight relabelling and dense proxy rewards need: "
+            f"{TASK_ENV_ADVICE}, or train plain PEARL, with replay_buffer_kwargs={{'relabel_probability': 0}}, "
+            "explorer='prior' and train_explorer='prior'."
+        )
 
 
 def get_max_episode_steps(env: VecEnv) -> int:

@@ -26,7 +26,8 @@ class TaskFamily(Protocol):
     """
     What PEARL asks of an env's ``task_family``: a small picklable object without state.
 
-    It is a protocol, so that envs need not import ``sb3_htr``; ``htr_envs.TaskFamily`` fulfils it.
+    It is a protocol, so that envs need not import ``sb3_htr``; ``htr_envs.TaskFamily`` fulfils it. Without the three methods
+    (``htr_envs.TaskDistribution``), nothing can be relabelled and no success be told: PEARL then learns with K = 0.
     """
 
     train_tasks: np.ndarray
@@ -96,7 +97,7 @@ class MultiTaskSamples(NamedTuple):
     :param task_ids: (M,) int array, the training task whose replay each row of the meta-batch came from
     :param relabelled: (M,) bool array, whether context and RL batch carry rewards of a hindsight task
     :param unrewarded: (M,) bool array, whether no reward of the RL batch has a part that depends on the task
-    :param labels: of some of these transitions, none unless asked for
+    :param labels: of some of these transitions, None unless asked for, and where the family tells no rewards
     """
 
     context: Context

@@ -10,13 +10,14 @@ from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from stable_baselines3.common.monitor import ResultsWriter
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from sb3_htr.common.atomic import reason
-from sb3_htr.common.checks import check_has_task_family, check_numbers
+from sb3_htr.common.checks import check_has_task_family, check_numbers, missing_hook
 
 # Attributes of a single task env, and where a batched one keeps those of all envs
 PER_ENV = {"task": "tasks", "task_id": "task_ids"}
@@ -140,6 +141,39 @@ class TaskVecMonitor(VecMonitor):
         return result
 
 
+class Float32VecEnv(VecEnvWrapper):
+    """
+    Rounds observations to float32, in which all networks see them and the replay buffer keeps them.
+
+    :param venv: its observations are of another type, as those of most MuJoCo envs
+    """
+
+    def __init__(self, venv: VecEnv) -> None:
+        space = venv.observation_space
+        assert isinstance(space, spaces.Box)
+        with np.errstate(over="ignore"):  # the largest float64 becomes infinity, as it is meant
+            low, high = (bound.astype(np.float32) for bound in (space.low, space.high))
+        super().__init__(venv, spaces.Box(low, high, dtype=np.float32))
+
+    def reset(self) -> VecEnvObs:
+        return np.asarray(self.venv.reset(), dtype=np.float32)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        obs, rewards, dones, infos = self.venv.step_wait()
+        for i in np.flatnonzero(dones):
+            infos[i]["terminal_observation"] = np.asarray(infos[i]["terminal_observation"], dtype=np.float32)
+        return np.asarray(obs, dtype=np.float32), rewards, dones, infos
+
+
+def in_float32(venv: VecEnv) -> VecEnv:
+    """
+    :param venv: any
+    :return: the same where its observations are float32 already, or no numbers in a Box
+    """
+    space = venv.observation_space
+    return Float32VecEnv(venv) if isinstance(space, spaces.Box) and space.dtype != np.float32 else venv
+
+
 def make_task_vec_env(
     env_id: str,
     n_envs: int = 1,
@@ -181,7 +215,8 @@ def make_task_vec_env(
         vector_env = gym.make_vec(env_id, n_envs, vectorization_mode="vector_entry_point", **env_kwargs)
         check_has_task_family(hasattr(vector_env, "task_family"))
         venv = BatchedTaskVecEnv(vector_env)
-    monitored = TaskVecMonitor(venv, info_keywords=("is_success",))
+    tells_success = missing_hook(venv.get_attr("task_family", [0])[0]) is None
+    monitored = TaskVecMonitor(venv, info_keywords=("is_success",) if tells_success else ())
     if monitor_dir is not None:
         header: dict[str, Any] = {"t_start": monitored.t_start, "env_id": env_id}
         monitored.results_writer = PatientResultsWriter(os.path.join(monitor_dir, "0"), header, monitored.info_keywords)

@@ -9,10 +9,10 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 
-from sb3_htr.common.checks import check_numbers, check_same_family, family_facts
+from sb3_htr.common.checks import check_has_hooks, check_numbers, check_same_family, family_facts, missing_hook
 from sb3_htr.common.random_state import get_generator_state, set_generator_state
 from sb3_htr.common.settings import make
-from sb3_htr.common.task_reward import task_reward
+from sb3_htr.common.task_reward import ROUNDING, task_reward
 from sb3_htr.common.type_aliases import Context, MultiTaskSamples, RewardLabels, TaskFamily
 from sb3_htr.htr.episode_store import EpisodeStore
 from sb3_htr.htr.relabel import RELABELLERS, Relabeller
@@ -64,7 +64,8 @@ class MultiTaskReplayBuffer(ReplayBuffer):
     :param device: where samples are put
     :param n_envs: number of envs that :meth:`add` receives
     :param optimize_memory_usage: for SB3's signature; must be False, episodes are stored whole
-    :param task_family: the env's ``task_family``: reward hook and training tasks
+    :param task_family: the env's ``task_family``: reward hook and training tasks. Where it has no hook, as
+        ``htr_envs.TaskDistribution`` has none, K must be 0
     :param max_episode_steps: time limit of the env
     :param relabel_probability: K, in [0, 1]. K = 0 is plain PEARL, bit for bit. The default was chosen by measurement
         (the paper sweeps .1 to 1 and does not name its best)
@@ -103,6 +104,8 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             raise ValueError(f'rl_reward_type is {rl_reward_type!r}, expected "sparse" or "dense".')
         if optimize_memory_usage:
             raise ValueError("optimize_memory_usage is not supported: MultiTaskReplayBuffer stores whole episodes.")
+        if relabel_probability > 0 or rl_reward_type == "dense":
+            check_has_hooks(task_family)
         n_tasks = len(task_family.train_tasks)
         episodes_per_task = buffer_size // (n_tasks * max_episode_steps)
         if episodes_per_task < 1:
@@ -129,7 +132,9 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         self.relabeller = copy.copy(make("relabeller", relabeller, RELABELLERS, Relabeller))
         self.relabeller.bind(self)
         # Told of every finished episode: the training task that it was collected on, and its transitions
-        self.episode_listeners: list[Callable[[int, np.ndarray], None]] = [self.relabeller.on_episode]
+        self.episode_listeners: list[Callable[[int, np.ndarray], None]] = []
+        if self.tells_rewards:
+            self.episode_listeners.append(self.relabeller.on_episode)
 
     def seed(self, seed: int | None) -> None:
         """
@@ -137,6 +142,11 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         """
         sequence = np.random.SeedSequence(seed)
         self._rng, self.relabel_rng = (np.random.default_rng(child) for child in sequence.spawn(2))
+
+    @property
+    def tells_rewards(self) -> bool:
+        """Whether the task family tells rewards and successes of any step under any task."""
+        return missing_hook(self.task_family) is None
 
     @property
     def n_tasks(self) -> int:
@@ -163,7 +173,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         if len(index.rows) == 0:
             return 0.0
         rows = episodes.rows[index.rows]
-        task_part = np.abs(rows[:, columns.reward] - rows[:, columns.task_free_reward]) > 0
+        task_part = np.abs(rows[:, columns.reward] - rows[:, columns.task_free_reward]) > ROUNDING
         return float((np.add.reduceat(task_part, index.episode_row[:-1]) > 0).mean())
 
     def stats(self) -> dict[str, float]:
@@ -237,8 +247,10 @@ class MultiTaskReplayBuffer(ReplayBuffer):
     def check_reward_hook(self, episodes: Sequence[tuple[int, np.ndarray]]) -> None:
         """
         :param episodes: training tasks and transitions (length, width) of some episodes
-        :raises ValueError: if the reward hook disagrees with what the env gave for them
+        :raises ValueError: if the reward hook disagrees with what the env gave for them, or a success is worth nothing
         """
+        if not self.tells_rewards:
+            return
         rows = np.concatenate([episode for _, episode in episodes])
         task = np.repeat([task for task, _ in episodes], [len(episode) for _, episode in episodes])
         traj = self.transitions.trajectory(rows[:, None])
@@ -250,6 +262,17 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             raise ValueError(
                 f"The env gave {given[i]:g} for a step of task {task[i]}, but its compute_reward gives {computed[i]:g}: "
                 "relabelled rewards would be of another task family. Run htr_envs.check_task_env(env) to find out why."
+            )
+        ends = np.cumsum([len(episode) for _, episode in episodes]) - 1
+        last = self.transitions.trajectory(rows[ends, None])
+        reward = self.task_family.compute_reward(last, self.task_family.hindsight_task(last, 0))
+        worthless = task_reward(reward, last.task_free_reward)[:, 0] <= 0
+        if worthless.any():
+            i = int(worthless.argmax())
+            raise ValueError(
+                f"A step is worth {reward[i, 0]:g} under the task that it solves, and its task-free reward is "
+                f"{last.task_free_reward[i, 0]:g}, so that nothing tells the success: info['task_free_reward'] must be what a "
+                "step returns that solves nothing, which is -1 where rewards are -1 and 0."
             )
 
     def discard_open_episodes(self) -> None:
@@ -337,7 +360,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         labels = self._label(rows[len(context) :], rows[: len(context)], n_context, reward_task, n_labelled)
         data = self.to_torch(rows, copy=False)
         context_rows, rl_rows = data[: len(context)], data[len(context) :]
-        unrewarded = rows[len(context) :, columns.reward] == rows[len(context) :, columns.task_free_reward]
+        beside = rows[len(context) :, columns.reward] - rows[len(context) :, columns.task_free_reward]
         return MultiTaskSamples(
             context=Context(
                 observations=context_rows[:, columns.observation],
@@ -353,7 +376,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             lengths=self.to_torch(n_batch, copy=False),
             task_ids=tasks,
             relabelled=relabelled,
-            unrewarded=np.logical_and.reduceat(unrewarded, np.cumsum(n_batch) - n_batch),
+            unrewarded=np.logical_and.reduceat(np.abs(beside) <= ROUNDING, np.cumsum(n_batch) - n_batch),
             labels=labels,
         )
 
@@ -361,13 +384,13 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         self, rows: np.ndarray, context: np.ndarray, n_context: np.ndarray, tasks: np.ndarray, n_labelled: int
     ) -> RewardLabels | None:
         """Some rows under all tasks; which of the tasks have a reward in their context."""
-        if n_labelled == 0:
+        if n_labelled == 0 or not self.tells_rewards:
             return None
         columns = self.transitions
         chosen = self._rng.permutation(len(rows))[:n_labelled]
         traj = columns.trajectory(rows[chosen])
         reward = task_reward(self.task_family.compute_reward(traj, tasks), traj.task_free_reward)
-        rewarded = context[:, columns.reward] != context[:, columns.task_free_reward]
+        rewarded = task_reward(context[:, columns.reward], context[:, columns.task_free_reward]) > 0
         inferred = np.logical_or.reduceat(rewarded, np.cumsum(n_context) - n_context)
         labels = (chosen, reward.T > 0, reward.T, traj.task_free_reward, inferred)
         dtypes = (np.int64, *[np.float32] * 4)

@@ -21,7 +21,7 @@ class Transitions:
         self.next_observation = slice(o + a + 1, 2 * o + a + 1)
         self.task_free_reward, self.done = 2 * o + a + 1, 2 * o + a + 2
         self.width = 2 * o + a + 3
-        self._low, self._high = action_space.low.ravel(), action_space.high.ravel()
+        self._low, self._high = (bound.ravel().astype(np.float32) for bound in (action_space.low, action_space.high))
         self._is_scaled = bool((self._low == -1).all() and (self._high == 1).all())
 
     def trajectory(self, rows: np.ndarray) -> Trajectory:

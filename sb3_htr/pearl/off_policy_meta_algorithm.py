@@ -33,7 +33,7 @@ from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.random_state import get_generator_state, set_generator_state
 from sb3_htr.common.saving import AtomicSave, with_suffix
 from sb3_htr.common.training_state import get_training_state, set_random_state, set_training_state
-from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.common.vec_env import in_float32, make_task_vec_env
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.pearl.horizon import complete, timesteps_for
 from sb3_htr.pearl.policies import PEARLPolicy
@@ -171,11 +171,21 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
     def _introduce_policy(self) -> None:
         if self.replay_buffer is not None:
             self.replay_buffer.relabeller.policy = self.policy
+            self.knowledge.set_tells_success(self.replay_buffer.tells_rewards)
+            for explorer in (self.explorer, self.train_explorer):
+                self._check_explorer(explorer)
+
+    def _check_explorer(self, explorer: Explorer) -> None:
+        if explorer.needs_success and not self.knowledge.tells_success:
+            raise ValueError(
+                f"The explorer {explorer.name!r} goes by successes, of which the env's task_family tells nothing: pass "
+                "explorer='prior' and train_explorer='prior'."
+            )
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         checks.check_is_no_gymnasium_vector_env(env)
-        return SAC._wrap_env(env, verbose, monitor_wrapper)
+        return in_float32(SAC._wrap_env(env, verbose, monitor_wrapper))
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """
@@ -295,7 +305,8 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
             # In each rollout: a sparse reward can go unseen for many, and the env may be another one than before
             replay_buffer.check_reward_hook(self.task_bank.new)
             self.task_bank.update()
-            self.logger.record("rollout/train_tasks_reached", self.task_bank.n_train_solved)
+            if replay_buffer.tells_rewards:
+                self.logger.record("rollout/train_tasks_reached", self.task_bank.n_train_solved)
             callback.on_rollout_end()
             self._n_rollouts += 1
             if log_interval is not None and self._n_rollouts % log_interval == 0:
@@ -382,8 +393,10 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
         :param generator: source of randomness; torch's global one by default
         :param is_training: whether infos tell which part of a reward depends on no task
         :return: chooses z and takes in what happens
+        :raises ValueError: if the explorer goes by successes, and the model was trained on a family without
         """
         chosen = self.explorer if explorer is None else to_explorer(explorer)
+        self._check_explorer(chosen)
         return Adaptation(self.policy, self.knowledge, chosen, n_envs, self.context_size, generator, is_training)
 
     def adapt(
@@ -413,7 +426,7 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
         """
         if n_episodes < 1:
             raise ValueError(f"n_episodes is {n_episodes}, expected at least 1.")
-        vec_env = make_task_vec_env(env) if isinstance(env, str) else self._wrap_env(env, monitor_wrapper=False)
+        vec_env = self._wrap_env(make_task_vec_env(env) if isinstance(env, str) else env, monitor_wrapper=False)
         if vec_env.num_envs != 1:
             raise ValueError(f"adapt() adapts to one task, but the VecEnv has {vec_env.num_envs} envs: pass a single env.")
         checks.check_is_not_normalized(vec_env)
@@ -432,7 +445,7 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
             episode = adaptation.n_episodes[0] - step.dones[0]
             returns[episode] += step.rewards[0]
             successes[episode] |= step.infos[0].get("is_success", adaptation.task_reward[0] > 0)
-        if adaptation.best_return[0] <= 0:
+        if adaptation.best_return[0] <= 0 and self.knowledge.tells_success:
             warnings.warn(
                 f"No reward was found in {n_episodes} episodes, so the agent is not adapted: allow more, or train longer.",
                 stacklevel=2,

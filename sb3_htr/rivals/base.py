@@ -40,7 +40,7 @@ class RivalAdaptation:
         """
         :param step: what each env did
         """
-        self._found |= [bool(info["is_success"]) for info in step.infos]
+        self._found |= [bool(info.get("is_success", False)) for info in step.infos]
 
     def exploring(self) -> np.ndarray:
         """

@@ -14,9 +14,9 @@ from stable_baselines3.sac import SAC
 from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_htr.adaptation.loop import Watched
-from sb3_htr.common.checks import check_numbers, get_max_episode_steps
+from sb3_htr.common.checks import check_is_no_gymnasium_vector_env, check_numbers, get_max_episode_steps
 from sb3_htr.common.type_aliases import Trajectory
-from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.common.vec_env import in_float32, make_task_vec_env
 from sb3_htr.rivals.base import Rival, ToldAdaptation
 from sb3_htr.rivals.shown_task import ShownTaskVecEnv
 
@@ -132,7 +132,8 @@ class SACHER(Rival, SAC):
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         if isinstance(env, ShownTaskVecEnv):
             return env
-        return ShownTaskVecEnv(SAC._wrap_env(env, verbose, monitor_wrapper))
+        check_is_no_gymnasium_vector_env(env)
+        return ShownTaskVecEnv(in_float32(SAC._wrap_env(env, verbose, monitor_wrapper)))
 
     def _setup_model(self) -> None:
         if self.env is None:

@@ -7,7 +7,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_htr.common.checks import check_spaces, get_task_family
+from sb3_htr.common.checks import check_has_hooks, check_spaces, get_task_family
 from sb3_htr.common.type_aliases import TaskFamily, Trajectory
 
 
@@ -18,9 +18,11 @@ class ShownTask:
 
     :param family: whose tasks are functions of a state
     :param action_space: Box
+    :raises ValueError: if the family does not tell which task a step solves
     """
 
     def __init__(self, family: TaskFamily, action_space: spaces.Box) -> None:
+        check_has_hooks(family)
         self.family = family
         self._action_dim = action_space.shape[0]
 

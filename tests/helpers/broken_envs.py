@@ -115,13 +115,13 @@ class SilentReset(LineEnv):
         return super().reset(**kwargs)[0], {}
 
 
-@breaks("An observation is not float32 or not in the observation space")
+@breaks("An observation is not in the observation space, or of its dtype")
 class Float64Observation(LineEnv):
     def alter(self, observation: Any, *others: Any) -> Any:
         return observation.astype(np.float64), *others
 
 
-@breaks("An observation is not float32 or not in the observation space")
+@breaks("An observation is not in the observation space, or of its dtype")
 class ObservationOutOfSpace(LineEnv):
     def alter(self, observation: Any, *others: Any) -> Any:
         return observation + np.float32(9.0), *others

@@ -21,32 +21,39 @@ def make_buffer(n_envs: int = 2, buffer_size: int = 8000, **kwargs: Any) -> Mult
 
 
 def add_episode(
-    buffer: MultiTaskReplayBuffer, tasks: list[int], length: int, rng: np.random.Generator, terminated: bool = False
+    buffer: MultiTaskReplayBuffer,
+    tasks: list[int],
+    length: int,
+    rng: np.random.Generator,
+    terminated: bool = False,
+    task_free: float = 0.0,
 ) -> None:
-    """Add one random walk per env, with the true reward of its task."""
+    """Add one random walk per env, with the true reward of its task beside what each step returns."""
     n = len(tasks)
     family = buffer.task_family
     obs = np.zeros((n, 2), dtype=np.float32)
     for step in range(length):
         action = rng.uniform(-1, 1, (n, 2)).astype(np.float32)
         next_obs = (obs + 0.1 * action).astype(np.float32)
-        traj = Trajectory(obs[:, None], action[:, None], next_obs[:, None], np.zeros((n, 1), dtype=np.float32))
+        traj = Trajectory(obs[:, None], action[:, None], next_obs[:, None], np.full((n, 1), task_free, dtype=np.float32))
         reward = family.compute_reward(traj, family.train_tasks[tasks])[:, 0]
         done = np.full(n, step == length - 1)
         infos: list[dict[str, Any]] = [
-            {"task_id": task, "task_free_reward": 0.0, "TimeLimit.truncated": bool(done[0]) and not terminated}
+            {"task_id": task, "task_free_reward": task_free, "TimeLimit.truncated": bool(done[0]) and not terminated}
             for task in tasks
         ]
         buffer.add(obs, next_obs, action, reward, done, infos)
         obs = next_obs
 
 
-def filled(walk_seed: int = 0, n_episodes: int = 6, lengths: tuple[int, ...] = (20,), **kwargs: Any) -> MultiTaskReplayBuffer:
+def filled(
+    walk_seed: int = 0, n_episodes: int = 6, lengths: tuple[int, ...] = (20,), task_free: float = 0.0, **kwargs: Any
+) -> MultiTaskReplayBuffer:
     """A buffer with so many episodes of each of two envs, on seven tasks."""
     rng = np.random.default_rng(walk_seed)
     buffer = make_buffer(**kwargs)
     for i in range(n_episodes):
-        add_episode(buffer, [i % 3, 3 + i % 4], lengths[i % len(lengths)], rng)
+        add_episode(buffer, [i % 3, 3 + i % 4], lengths[i % len(lengths)], rng, task_free=task_free)
     return buffer
 
 

@@ -140,3 +140,28 @@ def test_pearl_trains_with_it(tiny_pearl: MakePEARL) -> None:
 def test_bad_settings(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         filled(0, **settings)
+
+
+def test_cells_that_the_start_does_not_solve_are_preferred() -> None:
+    """Episodes stand still for 14 of 20 steps, each in another place, then leave it."""
+    unsolved = {}
+    for prefer in (False, True):
+        relabeller = {"name": "EpisodeClustering", "exploratory_fraction": 0.0, "prefer_unsolved": prefer}
+        buffer = make_buffer(n_envs=1, buffer_size=16_000, relabeller=relabeller)
+        assert isinstance(buffer.relabeller, EpisodeClustering)
+        rng = np.random.default_rng(0)
+        n_away = 0
+        for _ in range(40):
+            start = obs = rng.uniform(-5, 5, (1, 2)).astype(np.float32)
+            n_before = buffer.relabeller.episodes.n_added.copy()
+            for step in range(20):
+                action = np.full((1, 2), step >= 14, dtype=np.float32)
+                next_obs = (obs + 0.1 * action).astype(np.float32)
+                buffer.add(obs, next_obs, action, np.zeros(1), np.array([step == 19]), [{"task_id": 0}])
+                obs = next_obs
+            added = buffer.relabeller.episodes.n_added
+            (cell,) = np.flatnonzero(added != np.pad(n_before, (0, len(added) - len(n_before))))
+            n_away += bool(np.linalg.norm(buffer.relabeller._tasks[cell] - start[0]) >= FAMILY.goal_radius)
+        unsolved[prefer] = n_away / 40
+    # One of eight steps is among the last five with probability .9
+    assert unsolved[False] < 0.5 and unsolved[True] > 0.75

@@ -126,6 +126,45 @@ def test_candidates_are_chosen_inversely_to_how_common_they_are(counts: list[lis
     np.testing.assert_allclose(frequency, expected, atol=0.05)
 
 
+@given(st.lists(st.lists(st.booleans(), min_size=3, max_size=3), min_size=1, max_size=9), st.integers(0, 99))
+def test_solved_candidates_are_chosen_only_where_all_are(solved: list[list[bool]], seed: int) -> None:
+    is_solved = np.repeat(np.array(solved), 100, axis=0)
+    chosen = HindsightTaskStrategy.choose(np.ones(is_solved.shape), np.random.default_rng(seed), is_solved)
+    taken = np.take_along_axis(is_solved, chosen[:, None], axis=1)[:, 0]
+    np.testing.assert_array_equal(taken, is_solved.all(axis=1))
+    assert set(chosen[is_solved.all(axis=1)]) in (set(), {0, 1, 2}), "any of them"
+
+
+def starts_and_tasks(n_moving: int, **settings: Any) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Of 24 episodes of one task, so many leave the place where they began, each another place, in their last steps.
+
+    :return: where episodes began (n, 2), hindsight tasks (n, 2)
+    """
+    buffer = make_buffer(n_envs=1, buffer_size=40_000, **relabelling(**settings))
+    rng = np.random.default_rng(0)
+    for episode in range(24):
+        obs = rng.uniform(-5, 5, (1, 2)).astype(np.float32)
+        for step in range(20):
+            action = np.full((1, 2), episode < n_moving and step >= 14, dtype=np.float32)
+            next_obs, done = (obs + 0.1 * action).astype(np.float32), np.array([step == 19])
+            buffer.add(obs, next_obs, action, np.zeros(1), done, [{"task_id": 0, "task_free_reward": 0.0}])
+            obs = next_obs
+    draw = buffer.relabeller.draw(np.zeros(500, dtype=np.int64))
+    return draw.store.take(draw.context[:, 0])[:, buffer.transitions.observation], draw.tasks
+
+
+def test_tasks_that_the_start_does_not_solve_are_preferred() -> None:
+    solved = {}
+    for n_moving in (0, 12):
+        for prefer in (False, True):
+            starts, tasks = starts_and_tasks(n_moving, prefer_unsolved=prefer)
+            solved[n_moving, prefer] = (np.linalg.norm(starts - tasks, axis=1) < FAMILY.goal_radius).mean()
+    assert solved[0, False] == solved[0, True] == 1, "where nothing moved, any"
+    # A candidate is unsolved in 1/2 * 5/20 of the cases; of eight, one is with probability .66
+    assert solved[12, False] > 0.6 and solved[12, True] == pytest.approx((1 - 1 / 8) ** 8, abs=0.07)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

@@ -9,6 +9,7 @@ from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 
 from helpers.broken_envs import BROKEN, LineEnv, LineFamily, column
+from helpers.carts import CartEnv
 from htr_envs import PointRobotEnv, check_task_env
 
 # Annotations here are wide on purpose: most of these classes break the types that they should have.
@@ -62,8 +63,51 @@ def test_a_family_without(name: str) -> None:
 @pytest.mark.parametrize("name", ["observation_space", "action_space"])
 def test_spaces_of_another_type(name: str) -> None:
     env = LineEnv()
-    setattr(env, name, spaces.Box(-1.0, 1.0, (1,), np.float64))
-    assert_refused(env, f"The {name} must be a one-dimensional float32 Box")
+    setattr(env, name, spaces.Box(-1, 1, (1,), np.int64))
+    assert_refused(env, f"The {name} must be a one-dimensional Box of floats")
+
+
+def test_spaces_of_float64_are_fine() -> None:
+    class Double(LineEnv):
+        def __init__(self) -> None:
+            super().__init__()
+            self.observation_space = spaces.Box(-5.0, 5.0, (2,), np.float64)
+            self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float64)
+
+        def observe(self) -> Any:
+            return super().observe().astype(np.float64) / 3
+
+    env = Double()
+    assert env.reset()[0].dtype == env.step(env.action_space.sample())[0].dtype == np.float64
+    check_task_env(env)
+
+
+# ---------------------------------------------------------------- tasks that may change anything
+
+
+def test_an_env_whose_tasks_change_anything() -> None:
+    check_task_env(TimeLimit(CartEnv(), 10))
+
+
+class TellsItsTask(CartEnv):
+    def first(self) -> float:
+        return float(self.task[0])
+
+
+class Noisy(CartEnv):
+    def push(self, action: Any) -> float:
+        return super().push(action) + float(self.noise.normal())
+
+
+@pytest.mark.parametrize(
+    ("env_class", "sentence"),
+    [
+        (TellsItsTask, "The task leaks into the first observation"),
+        (Noisy, "The same seed, task and actions gave another episode"),
+    ],
+)
+def test_an_env_whose_tasks_change_what_they_must_not(env_class: type[CartEnv], sentence: str) -> None:
+    assert_refused(env_class(), sentence)
 
 
 @pytest.mark.parametrize(

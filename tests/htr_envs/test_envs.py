@@ -77,7 +77,8 @@ def test_sb3_check_env_without_a_warning(env_id: str) -> None:
 def test_check_task_env(env_id: str, reward_type: str) -> None:
     env, base = make(env_id, reward_type=reward_type)
     check_task_env(env)
-    check_task_env(base, n_episodes=1)
+    with pytest.raises(AssertionError, match="The env has no time limit"):
+        check_task_env(base)
 
 
 @all_envs

@@ -1,7 +1,7 @@
 """Exploration around what meta-training visits, and exploitation of the best episode."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -32,6 +32,8 @@ class Aggregate(Explorer):
         (two models, 40 tasks drawn anew) all tasks are solved in the last episode with 1.02, 90 and 97 % with 1, because the
         agent never settled
     """
+
+    needs_success: ClassVar[bool] = True
 
     scale: float = 1.5
     max_setbacks: int = 4

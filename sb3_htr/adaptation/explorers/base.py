@@ -3,7 +3,7 @@
 import copy
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import numpy as np
 
@@ -21,6 +21,9 @@ class Explorer(ABC):
     The object that a model is given holds settings; :meth:`begin` makes a copy that is in charge of one adaptation and owns
     its state. The copy may use the posterior and the episodes of :attr:`adaptation`, and through it what meta-training knows.
     """
+
+    #: Whether it goes by which rewards are those of a success, which not all families tell
+    needs_success: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         #: In YAML files and records

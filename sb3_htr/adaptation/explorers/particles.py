@@ -1,7 +1,7 @@
 """Bayes' rule over particles."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import torch as th
@@ -32,6 +32,8 @@ class ParticleExplorer(Explorer):
     :param temperature: power of each step's likelihood: steps of an episode are not independent
     :param noise: smallest standard deviation of rewards around those expected, relative to the mean reward of a success
     """
+
+    needs_success: ClassVar[bool] = True
 
     doubt: float = 0.02
     temperature: float = 0.5

@@ -5,9 +5,10 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import torch as th
 
+from sb3_htr.common.type_aliases import Trajectory
 from sb3_htr.htr.episode_store import EpisodeStore
 from sb3_htr.htr.relabel.base import HindsightDraw, Relabeller
-from sb3_htr.htr.relabel.hindsight_task import HindsightTaskStrategy
+from sb3_htr.htr.relabel.hindsight_task import HindsightTaskStrategy, solved_at_start
 
 if TYPE_CHECKING:
     from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
@@ -65,6 +66,8 @@ class EpisodeClustering(Relabeller):
         is our choice
     :param hindsight_task_strategy: which state of an episode is the hindsight task, before discretisation: ``"random"``,
         ``"final"``, or ``"even"`` (default), of several the one whose buffer has few episodes
+    :param prefer_unsolved: of several candidates, a task that was solved already where the episode began is chosen only if all
+        are
     :raises ValueError: for a value that is out of its range
     """
 
@@ -74,12 +77,14 @@ class EpisodeClustering(Relabeller):
         discretiser: Discretiser | None = None,
         exploratory_fraction: float = 0.3,
         hindsight_task_strategy: HindsightTaskStrategy | str = "even",
+        prefer_unsolved: bool = True,
     ) -> None:
         if not (isinstance(exploratory_fraction, int | float) and 0 <= exploratory_fraction < 1):
             raise ValueError(f"exploratory_fraction is {exploratory_fraction!r}, expected a number from 0 to below 1.")
         self.discretiser = GridDiscretiser(cell_size) if discretiser is None else discretiser
         self.exploratory_fraction = exploratory_fraction
         self.hindsight_task_strategy = HindsightTaskStrategy.of(hindsight_task_strategy)
+        self.prefer_unsolved = prefer_unsolved
 
     def bind(self, buffer: "MultiTaskReplayBuffer") -> None:
         super().bind(buffer)
@@ -128,10 +133,14 @@ class EpisodeClustering(Relabeller):
         buffer, strategy = self.buffer, self.hindsight_task_strategy
         rng = buffer.relabel_rng
         steps = strategy.steps(np.full(strategy.n_candidates, len(episode)), rng)
-        reached = buffer.task_family.hindsight_task(buffer.transitions.trajectory(episode), steps)
-        representatives = self.discretiser(reached)
-        count = np.array([1 + self._n_episodes_of(representative) for representative in representatives])
-        reached_task = representatives[strategy.choose(count[None], rng)[0]]
+        traj = buffer.transitions.trajectory(episode)
+        representatives = self.discretiser(buffer.task_family.hindsight_task(traj, steps))
+        count = np.array([[1 + self._n_episodes_of(representative) for representative in representatives]])
+        is_solved = None
+        if self.prefer_unsolved:
+            first = Trajectory(*(values[:1] for values in traj))
+            is_solved = solved_at_start(buffer.task_family, first, representatives)[None]
+        reached_task = representatives[strategy.choose(count, rng, is_solved)[0]]
         self._add(reached_task, episode)
         # As many exploratory episodes as make up their share: this one, under tasks that others reached, each once
         n_exploratory = self.exploratory_fraction / (1 - self.exploratory_fraction)

@@ -4,6 +4,8 @@ from enum import Enum
 
 import numpy as np
 
+from sb3_htr.common.type_aliases import TaskFamily, Trajectory
+
 
 class HindsightTaskStrategy(Enum):
     """
@@ -46,15 +48,35 @@ class HindsightTaskStrategy(Enum):
         return (rng.random(lengths.shape) * lengths).astype(np.int64)
 
     @staticmethod
-    def choose(count: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    def choose(count: np.ndarray, rng: np.random.Generator, is_solved: np.ndarray | None = None) -> np.ndarray:
         """
         Choose among candidates with probabilities inverse to how common they are.
 
         :param count: (n, n_candidates), how often something like the candidate was seen, more than 0
         :param rng: source of randomness
+        :param is_solved: (n, n_candidates) bool, candidates that are chosen only where all of the row are
         :return: (n,) int, index of the chosen candidate in each row
         """
         if count.shape[1] == 1:
             return np.zeros(len(count), dtype=np.int64)
-        cumulative = np.cumsum(1 / count, axis=1)
+        weight = 1 / count
+        if is_solved is not None:
+            weight = np.where(is_solved & ~is_solved.all(axis=1, keepdims=True), 0.0, weight)
+        cumulative = np.cumsum(weight, axis=1)
         return (rng.random((len(count), 1)) * cumulative[:, -1:] > cumulative).sum(axis=1)
+
+
+def solved_at_start(family: TaskFamily, first: Trajectory, tasks: np.ndarray) -> np.ndarray:
+    """
+    Whether tasks are solved before anything was done. Hindsight teaches nothing of them: their real episodes are rewarded.
+
+    A task is solved by the state that a step leads to. So the first state is seen as if a step had led to it. (What the first
+    step led to would be another question: it may have solved a task that is one step away.)
+
+    :param family: tells successes
+    :param first: first steps of episodes, arrays of shape (..., 1, dim)
+    :param tasks: (..., task_dim)
+    :return: (...) bool
+    """
+    before = Trajectory(first.observations, first.actions, first.observations, first.task_free_reward)
+    return np.asarray(family.is_success(before, tasks)[..., 0])

@@ -55,7 +55,7 @@ def main(argv: Sequence[str]) -> None:
     pictures = [output / "adaptation_curve.png"]
     title = f"{agent.env_id}, {len(tasks)} {args.tasks} tasks, explorer {explorer}"
     plot_adaptation_curve(record, pictures[0], title)
-    if tasks.shape[1] == 2:
+    if record.achieved.shape[-1] == 2:
         pictures.append(output / "adaptation_paths.png")
         start, radius = start_position(agent.make_env()), getattr(family, "goal_radius", None)
         plot_adaptation_paths(record, tasks, radius, start, pictures[1], title)

@@ -82,7 +82,7 @@ def adapt(agent: TrainedAgent, args: argparse.Namespace) -> Adapted:
         known_z = particles.z[particles.is_train].numpy()
         mean, deviation = adaptation.posterior()
         latent = Latent(tasks[found], mean[found], deviation[found], known_z)
-    start = start_position(agent.make_env()) if tasks.shape[1] == 2 else None
+    start = start_position(agent.make_env()) if record.achieved.shape[-1] == 2 else None
     explorer = args.explorer or model.explorer.name
     return Adapted(tasks, getattr(family, "goal_radius", None), start, explorer, record, latent)
 

@@ -1,0 +1,103 @@
+"""A family whose tasks change the dynamics: gymnasium's Walker2d with masses, damping and friction that it is not told.
+
+    python examples/walker_random_params.py      # meta-train by plain PEARL and adapt; hours on one core
+
+PEARL's walker-rand-params. The reward is the same in all tasks, and old experience says nothing about another body: there is
+nothing to relabel.
+"""
+
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.mujoco.walker2d_v5 import Walker2dEnv
+
+from htr_envs import MetaEnv, TaskDistribution
+from htr_envs.task_env import FloatArray
+
+# Arrays of MuJoCo's model, each number of which is multiplied by BASE to the power of one number of the task
+PARAMETERS = ("body_mass", "body_inertia", "dof_damping", "geom_friction")
+BASE, LIMIT = 1.5, 3.0
+
+
+class ScaleDistribution(TaskDistribution):
+    """
+    Exponents, uniform from -3 to 3.
+
+    :param n_parameters: length of a task
+    :param task_seed: seed of the 40 training, 10 validation and 10 test tasks
+    """
+
+    def __init__(self, n_parameters: int, task_seed: int = 1337) -> None:
+        self.n_parameters = n_parameters
+        tasks = self.sample_tasks(60, np.random.default_rng(task_seed))
+        super().__init__(spaces.Box(-LIMIT, LIMIT, (n_parameters,), np.float32), tasks[:40], tasks[40:50], tasks[50:])
+
+    def sample_tasks(self, n: int, rng: np.random.Generator) -> FloatArray:
+        return rng.uniform(-LIMIT, LIMIT, (n, self.n_parameters)).astype(np.float32)
+
+
+class WalkerRandomParamsEnv(MetaEnv):
+    """
+    Walker2d-v5 with a body of its own in each task.
+
+    :param render_mode: ``"rgb_array"`` or None
+    :param family_kwargs: of :class:`ScaleDistribution`
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 125}  # type: ignore[misc]
+
+    def __init__(self, render_mode: str | None = None, **family_kwargs: Any) -> None:
+        self.walker = Walker2dEnv(render_mode=render_mode)
+        self.original = {name: getattr(self.walker.model, name).copy() for name in PARAMETERS}
+        super().__init__(ScaleDistribution(sum(values.size for values in self.original.values()), **family_kwargs))
+        self.render_mode = render_mode
+        self.observation_space = self.walker.observation_space
+        self.action_space = self.walker.action_space
+
+    def _reset_state(self) -> FloatArray:
+        scale = BASE ** self.task.astype(np.float64)
+        for name, values in self.original.items():
+            getattr(self.walker.model, name)[:] = values * scale[: values.size].reshape(values.shape)
+            scale = scale[values.size :]
+        mujoco.mj_setConst(self.walker.model, self.walker.data)
+        obs, _ = self.walker.reset(seed=int(self.np_random.integers(2**31)))
+        return obs
+
+    def _step_state(self, action: FloatArray) -> tuple[FloatArray, float, bool]:
+        obs, reward, terminated, _, _ = self.walker.step(np.clip(action, -1, 1))
+        return obs, reward, terminated
+
+    def render(self) -> Any:
+        """Picture (480, 480, 3), uint8; None without a render mode."""
+        return self.walker.render()
+
+    def close(self) -> None:
+        """Release what draws the pictures."""
+        self.walker.close()
+
+
+gym.register("WalkerRandomParams-v0", entry_point=WalkerRandomParamsEnv, max_episode_steps=200)
+
+
+if __name__ == "__main__":
+    from sb3_htr import PEARL, evaluate_adaptation, make_task_vec_env
+
+    env = make_task_vec_env("WalkerRandomParams-v0", n_envs=20, seed=0)
+    # One episode with a z of the prior, then of the posterior
+    prior = {"name": "prior", "n_exploration_episodes": 1}
+    model = PEARL(
+        "MlpPolicy",
+        env,
+        replay_buffer_kwargs={"relabel_probability": 0.0},
+        explorer=prior,
+        train_explorer=prior,
+        n_episodes_per_task=3,
+        context_size=100,
+        seed=0,
+        verbose=1,
+    ).learn(1_000_000)
+    returns, _ = evaluate_adaptation(model, env, n_episodes=3)
+    print(f"return of episodes 1 to 3: {returns.mean(axis=0).round(1)}")

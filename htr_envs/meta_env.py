@@ -1,0 +1,271 @@
+"""Tasks, and the single environment that is given them.
+
+A *task* is a float vector (a goal position, a target speed, masses of limbs). What is here makes no promise about what a task
+changes. Where it changes the reward alone, and the reward is known as a function of a step, experience can be relabelled: that
+is ``htr_envs.TaskFamily`` and ``htr_envs.TaskEnv``.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.error import ResetNeeded
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float32]
+
+
+class TaskDistribution(ABC):
+    """A distribution of tasks and three fixed sets of them: small, picklable, stateless.
+
+    :param task_space: the box that every task lies in, shape (task_dim,).
+    :param train_tasks: tasks to meta-train on, shape (n, task_dim).
+    :param validation_tasks: tasks to choose hyper-parameters and checkpoints on, shape (n, task_dim).
+    :param test_tasks: tasks to report results on, shape (n, task_dim).
+    :raises ValueError: if an array has the wrong shape, leaves ``task_space``, or shares a task with another.
+    """
+
+    def __init__(
+        self, task_space: spaces.Box, train_tasks: ArrayLike, validation_tasks: ArrayLike, test_tasks: ArrayLike
+    ) -> None:
+        self.task_space = task_space
+        self.train_tasks: FloatArray = np.array(train_tasks, dtype=np.float32)
+        self.validation_tasks: FloatArray = np.array(validation_tasks, dtype=np.float32)
+        self.test_tasks: FloatArray = np.array(test_tasks, dtype=np.float32)
+        self._freeze()
+        seen: set[bytes] = set()
+        for name, tasks in self._task_sets().items():
+            if tasks.ndim != 2 or len(tasks) == 0:
+                raise ValueError(f"{name} has shape {tasks.shape}, expected (n, task_dim): pass at least one task.")
+            if not all(task_space.contains(task) for task in tasks):
+                raise ValueError(f"{name} holds a task that is not in {task_space}: widen the space or move it.")
+            # adding 0.0 turns -0.0 into 0.0, the same task with other bytes
+            keys = {(task + 0.0).tobytes() for task in tasks}
+            if keys & seen:
+                raise ValueError(f"{name} shares a task with another set: train, validation and test tasks must be disjoint.")
+            seen |= keys
+
+    def _task_sets(self) -> dict[str, FloatArray]:
+        return {
+            "train_tasks": self.train_tasks,
+            "validation_tasks": self.validation_tasks,
+            "test_tasks": self.test_tasks,
+        }
+
+    def _freeze(self) -> None:
+        for tasks in self._task_sets().values():
+            tasks.setflags(write=False)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._freeze()  # pickling forgets that an array is read-only
+
+    @abstractmethod
+    def sample_tasks(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw new tasks from the distribution that the fixed task sets stand for.
+
+        :param n: how many tasks.
+        :param rng: the only source of randomness.
+        :return: tasks, shape (n, task_dim).
+        """
+
+    def task_vectors(self, tasks: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+        """Check task vectors that a user gave and copy them.
+
+        :param tasks: one task or several.
+        :param shape: the shape that they must have, (..., task_dim).
+        :return: the tasks, float32.
+        :raises ValueError: if they are not numbers, have another shape, or lie outside ``task_space``.
+        """
+        try:
+            vectors = np.array(tasks, dtype=np.float32)
+        except (TypeError, ValueError):
+            raise ValueError(f"The task {tasks!r} is not made of numbers: pass a float vector of shape {shape}.") from None
+        if vectors.shape != shape:
+            raise ValueError(f"The task has shape {vectors.shape}, expected {shape}: pass a vector of the task space.")
+        # written so that nan, which compares with nothing, is refused too
+        if not np.all((vectors >= self.task_space.low) & (vectors <= self.task_space.high)):
+            raise ValueError(f"The task {vectors.tolist()} is not in {self.task_space}: pass a vector of the task space.")
+        return vectors
+
+    def task_indices(self, ids: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.int64]:
+        """Check ids of training tasks that a user gave and copy them.
+
+        :param ids: one id or several, indices into ``train_tasks``.
+        :param shape: the shape that they must have.
+        :return: the ids, int64.
+        :raises ValueError: if they are no integers, have another shape, or are out of range.
+        """
+        indices = np.asarray(ids)
+        n = len(self.train_tasks)
+        if not np.issubdtype(indices.dtype, np.integer):
+            raise ValueError(f"The task id {ids!r} is no integer: pass an index into train_tasks, from 0 to {n - 1}.")
+        if indices.shape != shape:
+            raise ValueError(f"The task id has shape {indices.shape}, expected {shape}: pass one id for each env.")
+        if np.any((indices < 0) | (indices >= n)):
+            raise ValueError(f"The task id {ids!r} is out of range: there are {n} training tasks, so pass 0 to {n - 1}.")
+        return indices.astype(np.int64)
+
+
+def task_from_options(options: dict[str, Any] | None) -> tuple[str, Any] | None:
+    """Read the options of a reset.
+
+    :param options: ``{"task_id": ...}``, ``{"task": ...}``, or nothing.
+    :return: the key and its value, or None where no task is given.
+    :raises ValueError: if there is an unknown key, or more than one.
+    """
+    if not options:
+        return None
+    unknown = sorted(str(key) for key in options if key not in ("task_id", "task"))
+    if unknown:
+        raise ValueError(f"Unknown reset options {unknown}: only 'task_id' and 'task' exist, remove the others.")
+    if len(options) > 1:
+        raise ValueError("The reset options hold both 'task_id' and 'task': pass only one of them.")
+    return next(iter(options.items()))
+
+
+class MetaEnv(gym.Env[FloatArray, FloatArray], ABC):
+    """An environment that is given tasks, which may change its rewards, dynamics and terminations.
+
+    PEARL learns it without relabelling. A subclass sets ``observation_space`` and ``action_space`` and writes ``_reset_state``
+    and ``_step_state``, which may ask for ``self.task``. The first observation must not tell the task.
+
+    The task of an episode is chosen at its reset. A task once given, by ``set_task`` or by the reset's options, stays over
+    later resets until it is changed; an env that was given none draws a random training task at each reset.
+
+    The infos of ``reset`` and ``step`` have ``task_id``: int, index into ``train_tasks``, -1 for a task given as a vector.
+
+    :param task_family: the tasks.
+    """
+
+    observation_space: spaces.Box  # type: ignore[assignment]
+    action_space: spaces.Box  # type: ignore[assignment]
+
+    def __init__(self, task_family: TaskDistribution) -> None:
+        self.task_family = task_family
+        self._given: tuple[int, FloatArray] | None = None
+        self._current: tuple[int, FloatArray] | None = None
+        # The latest one, in float32, in which it is stored and learnt from, whatever the space has
+        self._observation: FloatArray | None = None
+
+    @abstractmethod
+    def _reset_state(self) -> FloatArray:
+        """Put the dynamics in a start state, drawn with ``self.np_random``.
+
+        :return: first observation, shape (obs_dim,).
+        """
+
+    @abstractmethod
+    def _step_state(self, action: FloatArray) -> tuple[FloatArray, float, bool]:
+        """Move the dynamics by one step.
+
+        :param action: the agent's action, shape (act_dim,), float32, not clipped.
+        :return: next observation (obs_dim,), reward, whether the episode terminates.
+        """
+
+    def set_task(self, task: ArrayLike | None) -> None:
+        """Choose the task of the episodes from the next reset on.
+
+        :param task: an index into ``train_tasks``, a vector of ``task_space``, or None to draw a training task at each reset.
+        :raises ValueError: if the id is out of range or the vector is not in the task space.
+        """
+        if task is None:
+            self._given = None
+        elif np.ndim(task) == 0:
+            self._give("task_id", task)
+        else:
+            self._give("task", task)
+
+    def _give(self, key: str, value: Any) -> None:
+        if key == "task_id":
+            task_id = int(self.task_family.task_indices(value, ()))
+            self._given = (task_id, self.train_tasks[task_id])
+        else:
+            assert self.task_space.shape is not None
+            self._given = (-1, self.task_family.task_vectors(value, self.task_space.shape))
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[FloatArray, dict[str, Any]]:
+        """Start an episode.
+
+        :param seed: seed of the env's generator, None to go on with it.
+        :param options: ``{"task_id": i}`` (index into ``train_tasks``) or ``{"task": vector}``; like ``set_task`` before.
+        :return: first observation (obs_dim,) and an info with ``task_id``.
+        :raises ValueError: if an option is unknown or its task is invalid.
+        """
+        chosen = task_from_options(options)
+        super().reset(seed=seed)
+        if chosen is not None:
+            self._give(*chosen)
+        # drawn even if it is not used: a seed then gives the same starts whichever way the task was chosen
+        drawn = int(self.np_random.integers(len(self.train_tasks)))
+        self._current = (drawn, self.train_tasks[drawn]) if self._given is None else self._given
+        return self._remember_observation(self._reset_state()), {"task_id": self.task_id}
+
+    def _remember_observation(self, state: ArrayLike) -> FloatArray:
+        observation: FloatArray = np.array(state, dtype=self.observation_space.dtype)
+        self._observation = observation.astype(np.float32)
+        return observation
+
+    def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
+        """Do one step; the time limit is left to the TimeLimit wrapper.
+
+        :param action: the action, shape (act_dim,).
+        :return: next observation (obs_dim,), reward, terminated, False, info.
+        :raises ValueError: if the action has the wrong shape.
+        :raises gymnasium.error.ResetNeeded: before the first reset.
+        """
+        _, observation, reward, terminated = self._checked_step(action)
+        return observation, float(reward), bool(terminated), False, {"task_id": self.task_id}
+
+    def _checked_step(self, action: FloatArray) -> tuple[FloatArray, FloatArray, float, bool]:
+        """Check the action and move the dynamics.
+
+        :param action: what the agent gave.
+        :return: the action as float32, next observation, reward and termination of ``_step_state``.
+        """
+        if self._observation is None:
+            raise ResetNeeded("step was called before the first reset: call env.reset() first.")
+        action = np.array(action, dtype=np.float32)
+        if action.shape != self.action_space.shape:
+            raise ValueError(f"The action has shape {action.shape}, expected {self.action_space.shape}: pass one action.")
+        state, reward, terminated = self._step_state(action)
+        return action, self._remember_observation(state), reward, terminated
+
+    def _current_task(self) -> tuple[int, FloatArray]:
+        if self._current is None:
+            raise ResetNeeded("The env has no task before its first reset: call env.reset() first.")
+        return self._current
+
+    @property
+    def task(self) -> FloatArray:
+        """Task of the current episode, shape (task_dim,), a copy."""
+        return self._current_task()[1].copy()
+
+    @property
+    def task_id(self) -> int:
+        """Index of the current episode's task in ``train_tasks``, -1 for a task given as a vector."""
+        return self._current_task()[0]
+
+    @property
+    def task_space(self) -> spaces.Box:
+        """The box that every task lies in."""
+        return self.task_family.task_space
+
+    @property
+    def train_tasks(self) -> FloatArray:
+        """Tasks to meta-train on, shape (n, task_dim), read-only."""
+        return self.task_family.train_tasks
+
+    @property
+    def validation_tasks(self) -> FloatArray:
+        """Tasks to choose hyper-parameters and checkpoints on, shape (n, task_dim), read-only."""
+        return self.task_family.validation_tasks
+
+    @property
+    def test_tasks(self) -> FloatArray:
+        """Tasks to report results on, shape (n, task_dim), read-only."""
+        return self.task_family.test_tasks
