@@ -8,6 +8,7 @@ import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from helpers import ENV_ID
+from helpers.carts import make_cart
 from sb3_htr import evaluate_adaptation
 from sb3_htr.adaptation.adaptation import Step
 from sb3_htr.common.vec_env import make_task_vec_env
@@ -130,3 +131,10 @@ def test_it_has_no_explorers() -> None:
     assert model.start_adaptation(2, "own").exploring().all()
     with pytest.raises(ValueError, match="RL2 has no explorers, but the explorer is 'prior': leave it away"):
         model.start_adaptation(2, "prior")
+
+
+def test_tasks_may_change_anything() -> None:
+    """Also when episodes end, so that trials of one rollout are of different lengths."""
+    model = tiny_rl2(DummyVecEnv([make_cart, make_cart]), n_episodes_per_trial=3).learn(120)
+    returns, _ = evaluate_adaptation(model, DummyVecEnv([make_cart]), n_episodes=4)
+    assert returns.shape == (1, 4) and np.isfinite(returns).all()

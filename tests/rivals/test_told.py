@@ -5,8 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from helpers import ENV_ID
+from helpers.carts import make_cart
 from htr_envs import PointRobotFamily
 from sb3_htr import evaluate_adaptation
 from sb3_htr.common.vec_env import make_task_vec_env
@@ -97,3 +99,8 @@ def test_floor_and_ceiling_of_the_point_robot() -> None:
     assert successes.all() and 13.3 < returns.mean() < 13.4
     returns, successes = evaluate_adaptation(ScriptedAgent.random(space), ENV_ID, n_episodes=3)
     assert returns.mean() < 0.1 and successes.mean() < 0.02
+
+
+def test_a_family_without_hindsight_tasks_is_refused() -> None:
+    with pytest.raises(ValueError, match="task_family has no compute_reward, which hindsight relabelling"):
+        tiny_sac_her(DummyVecEnv([make_cart]))
