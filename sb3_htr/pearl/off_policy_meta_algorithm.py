@@ -139,6 +139,8 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
         self._pending_random: dict[str, Any] | None = None
 
     def _setup_model(self) -> None:
+        # Given to load() in place of those of the file, they are what a user writes
+        self.explorer, self.train_explorer = to_explorer(self.explorer), to_explorer(self.train_explorer)
         if self.env is None:
             # Loaded for prediction only: SB3 wants a buffer, we want no memory of it
             self.replay_buffer = ReplayBuffer(1, self.observation_space, self.action_space)  # type: ignore[assignment]

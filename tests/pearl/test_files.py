@@ -24,7 +24,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from helpers import ENV_ID, ROLLOUT, MakePEARL, many
 from helpers.bombs import Bomb, bombs
 from sb3_htr import PEARL, AdaptedAgent, evaluate_adaptation, load_untrusted
-from sb3_htr.adaptation import Belief, Prior
+from sb3_htr.adaptation import Aggregate, Belief, Prior
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr import EpisodeClustering
 from sb3_htr.pearl.untrusted import NUMBERS, WORDS
@@ -82,6 +82,12 @@ def test_loading_an_untrusted_model_runs_no_code(tiny_pearl: MakePEARL, tmp_path
         load_untrusted(tmp_path / "bomb.zip", ENV_ID)
     load_untrusted(tmp_path / "bomb.zip", ENV_ID, explorer="belief")
     assert not fuse.exists()
+
+
+def test_explorers_can_be_given_in_place_of_those_of_the_file(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    tiny_pearl().save(tmp_path / "model")
+    loaded = PEARL.load(tmp_path / "model", explorer="prior", train_explorer={"name": "aggregate", "scale": 2.0})
+    assert loaded.explorer == Prior() and loaded.train_explorer == Aggregate(scale=2.0)
 
 
 def test_an_untrusted_model_acts_as_the_one_that_was_saved(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
