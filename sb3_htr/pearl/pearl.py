@@ -55,8 +55,8 @@ class PEARL(OffPolicyMetaAlgorithm):
     :param kl_coef: weight of the KL divergence of the posterior from N(0, I), summed over z's dimensions and averaged over
         tasks, beside the critics' squared errors averaged over transitions (PEARL's reference, in these units: 0.0016)
     :param reward_coef: weight of the losses of the reward model, which shape z as well: z must tell tasks apart. By
-        measurement, on a two-link arm (one seed): .91 of the tasks are solved at 0, .99 and more at .5 and 2. It learns in each
-        update, for a fifth of their time: in one of four, at four times the weight, the Wheeled robot solves .90 of the
+        measurement, on a two-link arm (one seed): .91 of the tasks are solved at 0, .99 and more at .5 and 2. It learns in
+        each update, for a fifth of their time: in one of four, at four times the weight, the Wheeled robot solves .90 of the
         validation tasks in place of all (one seed)
     :param n_tasks_per_rollout: training tasks per rollout (PEARL's reference: 10)
     :param n_episodes_per_task: episodes on each of them, from 2 to 10 by default, of 400 steps in all
