@@ -164,23 +164,33 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         """
         return len(self.episodes.index().rows)
 
+    def rewarded(self, episodes: EpisodeStore) -> np.ndarray:
+        """
+        :param episodes: the buffer's own, or those of a relabeller
+        :return: (n_episodes,) bool, which of them have a reward beside the task-free one, in the order of their index
+        """
+        index, columns = episodes.index(), self.transitions
+        if len(index.rows) == 0:
+            return np.zeros(0, dtype=bool)
+        reward, task_free = (episodes.rows[index.rows, column] for column in (columns.reward, columns.task_free_reward))
+        return np.logical_or.reduceat(np.abs(reward - task_free) > ROUNDING, index.episode_row[:-1])
+
     def rewarded_fraction(self, episodes: EpisodeStore) -> float:
         """
         :param episodes: the buffer's own, or those of a relabeller
         :return: share of them with a reward beside the task-free one, 0 if there are none
         """
-        index, columns = episodes.index(), self.transitions
-        if len(index.rows) == 0:
-            return 0.0
-        rows = episodes.rows[index.rows]
-        task_part = np.abs(rows[:, columns.reward] - rows[:, columns.task_free_reward]) > ROUNDING
-        return float((np.add.reduceat(task_part, index.episode_row[:-1]) > 0).mean())
+        rewarded = self.rewarded(episodes)
+        return float(rewarded.mean()) if len(rewarded) else 0.0
 
     def stats(self) -> dict[str, float]:
         """
         :return: what is worth logging, by its key
         """
         own = {"replay/transitions": self.size(), "replay/megabytes": self.episodes.nbytes / 1e6}
+        if self.tells_rewards:
+            task = np.repeat(np.arange(self.n_tasks), self.n_episodes)
+            own["replay/tasks_rewarded"] = len(np.unique(task[self.rewarded(self.episodes)]))
         return {**own, **self.relabeller.stats()}
 
     def add(

@@ -60,6 +60,18 @@ def test_only_complete_episodes_can_be_sampled() -> None:
     assert buffer.size() == 0
 
 
+def test_a_task_counts_as_rewarded_if_one_of_its_own_episodes_is() -> None:
+    """Whatever depends on no task, such as a cost of each step, is no reward."""
+    buffer, cost = make_buffer(n_envs=1), -0.25
+    assert buffer.stats()["replay/tasks_rewarded"] == 0
+    for task, reward in ((3, 0.0), (3, 1.0), (3, 0.0), (5, 0.0), (7, 0.5), (9, 0.0)):
+        step, info = np.zeros((1, 2), dtype=np.float32), {"task_id": task, "task_free_reward": cost}
+        for last in (False, True):
+            buffer.add(step, step, step, np.array([cost + reward]), np.array([last]), [info])
+    assert buffer.stats()["replay/tasks_rewarded"] == 2
+    assert buffer.rewarded(buffer.episodes).tolist() == [False, True, False, False, True, False]
+
+
 def test_a_time_limit_is_not_a_termination() -> None:
     for terminated in (False, True):
         buffer = make_buffer(relabel_probability=0)
