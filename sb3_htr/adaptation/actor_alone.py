@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.sac.policies import Actor
 from torch import nn
 
-from sb3_htr.common.linear import with_fast_linear
+from sb3_htr.common.linear import with_fast_layers
 from sb3_htr.common.normalizer import ObservationNormalizer
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {
@@ -46,7 +46,7 @@ class ActorAlone(BasePolicy):
         of_actor = spaces.Box(-np.inf, np.inf, (obs_dim + latent_dim,), np.float32)
         extractor = FlattenExtractor(of_actor)
         self.actor = Actor(of_actor, action_space, net_arch, extractor, extractor.features_dim, activation_fn)
-        with_fast_linear(self.actor)
+        with_fast_layers(self.actor)
         self.normalizer = ObservationNormalizer(obs_dim) if normalized else None
 
     def predict(

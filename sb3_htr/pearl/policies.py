@@ -14,7 +14,7 @@ from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, SACP
 from torch import nn
 
 from sb3_htr.adaptation.context import context_dim, context_rows
-from sb3_htr.common.linear import Linear, with_fast_linear
+from sb3_htr.common.linear import Linear, Stack, with_fast_layers
 from sb3_htr.common.normalizer import ObservationNormalizer
 from sb3_htr.common.type_aliases import Context
 from sb3_htr.pearl.encoder import ContextEncoder
@@ -46,9 +46,9 @@ class LatentCritic(BaseModel):
         self.n_critics = n_critics
         units = [observation_space.shape[0] + action_space.shape[0], *net_arch]
 
-        def network() -> nn.Sequential:
+        def network() -> Stack:
             hidden = [(Linear(i, o), nn.LayerNorm(o), activation_fn()) for i, o in pairwise(units)]
-            return nn.Sequential(*(module for layer in hidden for module in layer), Linear(units[-1], 1))
+            return Stack(*(module for layer in hidden for module in layer), Linear(units[-1], 1))
 
         self.networks = nn.ModuleList(network() for _ in range(n_critics))
 
@@ -147,7 +147,7 @@ class PEARLPolicy(SACPolicy):
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         actor = super().make_actor(features_extractor)
-        with_fast_linear(actor)
+        with_fast_layers(actor)
         return actor
 
     def make_critic(self, features_extractor: nn.Module | None = None) -> LatentCritic:  # type: ignore[override]

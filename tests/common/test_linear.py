@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import nn
 
-from sb3_htr.common.linear import MIN_ROWS, Linear, with_fast_linear
+from sb3_htr.common.linear import MIN_ROWS, Linear, with_fast_layers
 from sb3_htr.common.matmul import matmul_precision
 
 
@@ -45,7 +45,7 @@ def test_replaced_layers_keep_their_parameters() -> None:
     module = nn.Sequential(nn.Linear(3, 4), nn.Sequential(nn.ReLU(), nn.Linear(4, 2)))
     before = copy.deepcopy(module.state_dict())
     parameters = list(module.parameters())
-    assert with_fast_linear(module) is module
+    assert with_fast_layers(module) is module
     assert isinstance(module[0], Linear) and isinstance(module[1][1], Linear)  # type: ignore[index]
     assert all(a is b for a, b in zip(module.parameters(), parameters, strict=True))
     assert all(th.equal(before[name], value) for name, value in module.state_dict().items())
