@@ -59,7 +59,7 @@ class LatentCritic(BaseModel):
         :return: (n_critics, n)
         """
         x = th.cat([obs, actions], dim=1)
-        return th.cat([network(x) for network in self.networks], dim=1).T
+        return th.cat([network(x).T for network in self.networks])
 
 
 class PEARLPolicy(SACPolicy):
