@@ -107,13 +107,18 @@ class _Stack(th.autograd.Function):
 
 
 def _forward(
-    x: th.Tensor, layer: _Layer, weight: th.Tensor, bias: th.Tensor, *affine: th.Tensor
+    x: th.Tensor,
+    layer: _Layer,
+    weight: th.Tensor,
+    bias: th.Tensor,
+    gain: th.Tensor | None = None,
+    shift: th.Tensor | None = None,
 ) -> tuple[th.Tensor, tuple[th.Tensor, ...]]:
     """Output of a layer, and what its normalization keeps for the backward pass."""
     if layer.eps is None:
         return _product(x, weight, bias, layer.rectified), ()
     h = _product(x, weight, bias)
-    y, mean, rstd = th.native_layer_norm(h, h.shape[1:], *affine, layer.eps)
+    y, mean, rstd = th.native_layer_norm(h, h.shape[1:], gain, shift, layer.eps)
     return (y.relu_() if layer.rectified else y), (h, mean, rstd)
 
 
