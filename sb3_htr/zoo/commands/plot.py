@@ -163,9 +163,8 @@ def print_time_to_solved(groups: dict[str, list[TrainedAgent]]) -> None:
         if times:
             steps, seconds = np.median(times, axis=0)
             clock = "" if np.isnan(seconds) else f", {seconds:,.0f} seconds with evaluations"
-            print(
-                f"{label}: 95 % of the last evaluation's return after {steps:,.0f} env steps{clock} (median of {len(times)})"
-            )
+            runs = f" (median of {len(times)} runs)" if len(times) > 1 else ""
+            print(f"{label}: 95 % of the last evaluation's return after {steps:,.0f} env steps{clock}{runs}")
 
 
 def main(argv: Sequence[str]) -> None:
