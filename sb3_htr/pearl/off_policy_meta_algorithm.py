@@ -308,6 +308,9 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
         if continue_training:
             # In each rollout: a sparse reward can go unseen for many, and the env may be another one than before
             replay_buffer.check_reward_hook(self.task_bank.new)
+            # Now and not step by step: what a posterior takes in during a rollout stays on one scale
+            columns = replay_buffer.transitions
+            self.policy.watch(np.concatenate([episode[:, columns.observation] for _, episode in self.task_bank.new]))
             self.task_bank.update()
             if replay_buffer.tells_rewards:
                 self.logger.record("rollout/train_tasks_reached", self.task_bank.n_train_solved)
@@ -354,7 +357,6 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
 
     def _explore(self, adaptation: Adaptation, learning_starts: int, obs: np.ndarray) -> np.ndarray:
         """Actions of a rollout, scaled to [-1, 1]."""
-        self.policy.watch(obs)
         if self.num_timesteps < learning_starts:
             return self._rng.uniform(-1, 1, (len(obs), *self.action_space.shape)).astype(np.float32)  # type: ignore[misc]
         return adaptation.act(obs, deterministic=False)
