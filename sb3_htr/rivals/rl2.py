@@ -137,15 +137,23 @@ class RL2(Rival, RecurrentPPO):
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """
-        :param env: env of the same spaces and number of copies
+        :param env: env of the same spaces, number of copies and time limit
         :param force_reset: reset before training goes on
+        :raises ValueError: for another time limit
         """
         super().set_env(env, force_reset)
         self._set_trials()
 
     def _set_trials(self) -> None:
-        if self.env is not None:
-            self.env.n_episodes = self.n_episodes_per_trial
+        if self.env is None:
+            return
+        self.env.n_episodes = self.n_episodes_per_trial
+        n_steps = self.n_trials_per_rollout * self.env.max_trial_steps
+        if n_steps != self.n_steps:
+            raise ValueError(
+                f"Whole trials in this env are rollouts of {n_steps} steps, but those of the model have {self.n_steps}: give "
+                "an env of the same time limit, or make a new model."
+            )
 
     def dump_logs(self, iteration: int = 0) -> None:
         """
