@@ -13,8 +13,11 @@ from sb3_htr.experiments.protocol import scores
 from sb3_htr.zoo.plots.curves import band, finish
 from sb3_htr.zoo.plots.intervals import iqm_interval
 from sb3_htr.zoo.plots.style import COLOURS, curve_styles, save
+from sb3_htr.zoo.run.method import OWN
 
 Results = dict[Cell, Path]
+# Of the explorers in the picture, in the env of the training: without settings of another one, an evaluation's name is theirs
+STYLES = {"belief": "-", OWN: "-", "prior": "--"}
 
 
 def by_variant(results: Results) -> dict[str, list[tuple[Cell, Any]]]:
@@ -48,11 +51,13 @@ def learning(results: Results, path: Path) -> None:
     for (colour, _), (variant, runs) in zip(curve_styles([*groups]), groups.items(), strict=True):
         curve = np.stack([raw["curve"].mean(axis=1) for _, raw in runs])
         band(left, runs[0][1]["timesteps"] / 1000, curve, colour, "-", variant)
-        for explorer, style in zip(("belief", "prior"), ("-", "--"), strict=True):
-            if f"returns_{explorer}" not in runs[0][1]:
-                continue
-            returns = np.stack([raw[f"returns_{explorer}"] for _, raw in runs])
-            band(right, np.arange(1, returns.shape[-1] + 1), returns, colour, style, f"{variant}, explorer {explorer}")
+        for evaluation in runs[0][0].evaluations:
+            if evaluation.name in STYLES:
+                returns, label = (
+                    np.stack([raw[f"returns_{evaluation.name}"] for _, raw in runs]),
+                    f"{variant}, {evaluation.name}",
+                )
+                band(right, np.arange(1, returns.shape[-1] + 1), returns, colour, STYLES[evaluation.name], label)
     left.set_xlabel("thousand env steps of meta-training")
     left.set_ylabel("return of the last adaptation episode")
     left.set_title("validation tasks, during meta-training", fontsize=10)
@@ -90,7 +95,6 @@ def goal_distance(results: Results, path: Path) -> None:
     groups = by_variant(results)
     for (colour, _), (variant, runs) in zip(curve_styles([*groups]), groups.items(), strict=True):
         x = sorted({cell.env_kwargs["goal_distance"] for cell, _ in runs})
-
         ordered = sorted(runs, key=lambda run: (run[0].env_kwargs["goal_distance"], run[0].seed))
         optimum = [optimal_return(**cell.env_kwargs) for cell, _ in ordered]
         for axes, metric in ((left, "last_episode_return"), (right, "success_rate")):

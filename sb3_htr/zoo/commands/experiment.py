@@ -5,6 +5,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from sb3_htr.common.checks import check_numbers
 from sb3_htr.zoo.commands.arguments import make_parser
 
 EXAMPLE = """  sb3-htr experiment point_robot --jobs 2
@@ -31,6 +32,8 @@ def main(argv: Sequence[str]) -> None:
     where.add_argument("--ray", metavar="ADDRESS", help="run on a Ray cluster; auto for the one of this machine")
     where.add_argument("--cell", type=int, metavar="I", help="run number I alone, from 0, for job arrays; writes no results")
     args = parser.parse_args(argv)
+    given = {"--seeds": args.seeds, "--jobs": args.jobs}
+    check_numbers(**{name: (n, 1, float("inf")) for name, n in given.items() if n is not None})
     experiment = grid.EXPERIMENTS[args.name]
     cells = experiment.cells(1, 0.1) if args.quick else experiment.cells(args.seeds)
     if args.cell is not None and not 0 <= args.cell < len(cells):
