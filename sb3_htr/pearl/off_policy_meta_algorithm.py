@@ -29,6 +29,7 @@ from sb3_htr.adaptation.loop import adaptation_steps
 from sb3_htr.adaptation.task_bank import TaskBank
 from sb3_htr.common import checks
 from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.latent_policy import Obs, State
 from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.random_state import get_generator_state, set_generator_state
 from sb3_htr.common.saving import AtomicSave, with_suffix
@@ -455,12 +456,8 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
         return AdaptedAgent(self.policy, adaptation.explorer.final_z()[0], returns, successes)
 
     def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        self, observation: Obs, state: State = None, episode_start: np.ndarray | None = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, State]:
         """
         :param observation: (obs_dim,) or (n, obs_dim)
         :param state: tuple of one array, z of each observation (n, latent_dim); without it the agent is not adapted to any
