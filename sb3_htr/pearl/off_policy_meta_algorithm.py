@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, TrainFreq
 from stable_baselines3.common.utils import check_for_correct_spaces
@@ -29,6 +29,7 @@ from sb3_htr.adaptation.loop import adaptation_steps
 from sb3_htr.adaptation.task_bank import TaskBank
 from sb3_htr.common import checks
 from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.callback import followed_by
 from sb3_htr.common.latent_policy import Obs, State
 from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.random_state import get_generator_state, set_generator_state
@@ -253,11 +254,7 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
         )
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        shown = super()._init_callback(callback)
-        if progress_bar:
-            shown = CallbackList([shown, MetaProgressBarCallback()])
-            shown.init_callback(self)
-        return shown
+        return super()._init_callback(followed_by(callback, MetaProgressBarCallback()) if progress_bar else callback)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         assert self.replay_buffer is not None

@@ -7,12 +7,13 @@ from typing import Any, ClassVar
 import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.adaptation import Step
 from sb3_htr.adaptation.loop import Watched
+from sb3_htr.common.callback import followed_by
 from sb3_htr.common.saving import AtomicSave
 from sb3_htr.common.training_state import get_training_state, set_random_state, set_training_state
 
@@ -136,9 +137,7 @@ class Rival(AtomicSave, BaseAlgorithm):
         self._last_episode_starts = np.ones(self.env.num_envs, dtype=bool)
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        with_start = CallbackList([super()._init_callback(callback, progress_bar), FreshStart()])
-        with_start.init_callback(self)
-        return with_start
+        return super()._init_callback(followed_by(callback, FreshStart()), progress_bar)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         if self.env is None:
