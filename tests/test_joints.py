@@ -2,10 +2,11 @@
 
 import inspect
 import json
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import matplotlib.pyplot as plt
@@ -17,17 +18,14 @@ from gymnasium import spaces
 from torch import nn
 from torch.nn import functional as F
 
-from helpers import ENV_ID, ROLLOUT, TINY, MakePEARL, parameters, with_policy
+from helpers import ENV_ID, ROLLOUT, MakePEARL, parameters, with_policy
 from helpers.experience import by_task
 from helpers.runs import run_folder, train_arguments
 from htr_envs import Dynamics, DynamicsEnv, DynamicsVectorEnv, TaskFamily, at_step, check_reward_type, check_task_env
 from sb3_htr import PEARL, evaluate_adaptation
-from sb3_htr.adaptation import Belief, Explorer, Step
+from sb3_htr.adaptation import Explorer, Step
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
-from sb3_htr.experiments import grid, report
-from sb3_htr.experiments.cell import Evaluation
-from sb3_htr.experiments.grid import Experiment, Variant
-from sb3_htr.experiments.runner import run_cell
+from sb3_htr.experiments import grid
 from sb3_htr.htr import Relabeller
 from sb3_htr.htr.relabel import RELABELLERS, HindsightDraw
 from sb3_htr.zoo.cli import main
@@ -327,70 +325,92 @@ def test_an_env_family(heights: str, tiny_pearl: MakePEARL) -> None:
     assert single.shape == (10, 1)
 
 
-# --- an experiment
+# --- a method, and an experiment with it
 
+# A module of somebody's own
+OWN = """
+import matplotlib.pyplot as plt
+from sb3_htr.experiments.grid import EXPERIMENTS, Experiment, Variant, by
+from sb3_htr.zoo.run.method import register_method
 
-def test_an_experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A row of the grid; what it draws is its own too."""
+register_method(
+    "half-half",
+    label="Relabelled every other time, acted with at random",
+    relabeller="EpisodeClustering",
+    relabel_probability=0.5,
+    rl_reward_type="dense",
+    train_explorer="belief",
+    explorer="aggregate",
+)
+small = {"n_envs": 4, "n_tasks_per_rollout": 4, "n_episodes_per_task": 3, "learning_starts": 240, "gradient_steps": 2}
+networks = {"policy_kwargs": {"net_arch": [16], "encoder_arch": [16]}}
+row = Variant("half-half", "half", {**small, **networks})
 
-    def figure(results: Any, path: Path) -> None:
-        plt.figure(figsize=(1, 1)).savefig(path)
-        drawn.extend(cell.variant for cell in results)
+def draw(results, path):
+    plt.figure(figsize=(1, 1)).savefig(path, dpi=len(results))
 
-    drawn: list[str] = []
-    tiny = {**yaml.safe_load("{n_envs: 4, learning_starts: 240}"), **{key: TINY[key] for key in TINY if key != "seed"}}
-    row = Variant("htr-ser", "sharp", {**tiny, "explorer": {"margin": 0.7}})
-    experiment = Experiment(
-        "toy", "A toy.", ENV_ID, 960, (row,), 1, 480, evaluations=(Evaluation("aggregate", {}),), figure=figure
-    )
-    monkeypatch.setattr("sb3_htr.experiments.protocol.EVAL_SEEDS", (1,))
-    monkeypatch.setitem(grid.EXPERIMENTS, "toy", experiment)
-    runs, results = tmp_path / "runs", tmp_path / "results"
-    runs.mkdir()
-    (cell,) = experiment.cells()
-    assert run_cell(cell, runs)
-    report.write("python toy.py", experiment, {cell: cell.result(runs)}, results)
-    assert drawn == ["sharp"] and (results / "toy.png").exists()
-    summary = json.loads((results / "summary.json").read_text())
-    assert [row["variant"] for row in summary["rows"] if row["metric"] == "success_rate"] == drawn
-    agent = agent_at(cell.run_folder(runs))
-    assert agent.method == "htr-ser" and agent.load().explorer == Belief(margin=0.7)
-
-
-# --- a method
-
-
-TOY_METHOD = """
-half-half:
-  label: 'Relabelled every other time, acted with at random'
-  relabeller: 'EpisodeClustering'
-  relabel_probability: 0.5
-  rl_reward_type: 'dense'
-  train_explorer: 'belief'
-  explorer: 'aggregate'
+EXPERIMENTS["toy"] = Experiment(
+    "toy", "A toy.", "SparsePointRobot-v0", 480, (row,), 1, evaluations=by(("aggregate",)), figure=draw
+)
 """
 
 
-def test_a_method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """A block of methods.yml."""
-    (tmp_path / "methods.yml").write_text(hyperparams_file("methods.yml").read_text() + TOY_METHOD)
-    monkeypatch.setattr(method, "hyperparams_file", lambda name: tmp_path / name)
+@pytest.fixture
+def own_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A module to be named on the command line, and forgotten afterwards."""
+    (tmp_path / "half_half.py").write_text(OWN)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(grid.EXPERIMENTS, "toy", cast(Any, None))
+    monkeypatch.setattr("sb3_htr.experiments.protocol.EVAL_SEEDS", (1,))
+    yield "half_half"
+    sys.modules.pop("half_half", None)
     method.methods.cache_clear()
-    try:
-        assert main(train_arguments(tmp_path, 480, "--method", "half-half")) == 0
-        run = run_folder(tmp_path, "half-half")
-        model = agent_at(run, "last").load(trust=True)
-        assert isinstance(model, PEARL)
-        assert json.loads((run / RECORD).read_text())["method"] == "half-half"
-        assert (model.explorer.name, model.train_explorer.name) == ("aggregate", "belief")
-        buffer: Any = model.replay_buffer_kwargs
-        assert (buffer["relabel_probability"], buffer["rl_reward_type"]) == (0.5, "dense")
-        assert buffer["relabeller"]["name"] == "EpisodeClustering"
-        capsys.readouterr()
-        few = ["--no-render", "--n-tasks", "1", "--n-episodes", "1"]
-        assert main(["enjoy", "--env", ENV_ID, "-f", str(tmp_path), "--method", "half-half", *few]) == 0
-        assert f"{run}" in capsys.readouterr().out
-        assert main(train_arguments(tmp_path, 240, "--method", "half-half-prior")) == 0
-        assert agent_at(run_folder(tmp_path, "half-half-prior"), "last").load().explorer.name == "prior"
-    finally:
-        method.methods.cache_clear()
+
+
+def test_a_method(own_module: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of the command line, which names the module."""
+    packages = ["--gym-packages", own_module]
+    assert main(train_arguments(tmp_path, 480, *packages, "--method", "half-half")) == 0
+    run = run_folder(tmp_path, "half-half")
+    model = agent_at(run, "last").load(trust=True)
+    assert isinstance(model, PEARL)
+    assert json.loads((run / RECORD).read_text())["method"] == "half-half"
+    assert (model.explorer.name, model.train_explorer.name) == ("aggregate", "belief")
+    buffer: Any = model.replay_buffer_kwargs
+    assert (buffer["relabel_probability"], buffer["rl_reward_type"]) == (0.5, "dense")
+    assert buffer["relabeller"]["name"] == "EpisodeClustering"
+    capsys.readouterr()
+    few = ["--no-render", "--n-tasks", "1", "--n-episodes", "1"]
+    assert main(["enjoy", "--env", ENV_ID, "-f", str(tmp_path), *packages, "--method", "half-half", *few]) == 0
+    assert f"{run}" in capsys.readouterr().out
+    assert main(train_arguments(tmp_path, 240, *packages, "--method", "half-half-prior")) == 0
+    assert agent_at(run_folder(tmp_path, "half-half-prior"), "last").load().explorer.name == "prior"
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"name": "htr-ser"}, "There is a method 'htr-ser' already"),
+        ({"explorer": "believe"}, "The explorer of the method 'mine' is 'believe', expected one of"),
+        ({"algorithm": "maml"}, "'mine' is not whole"),
+        ({"relabelled": 1}, "'mine' is not whole"),
+    ],
+)
+def test_a_method_that_is_not_whole(settings: dict[str, Any], message: str) -> None:
+    block = yaml.safe_load(hyperparams_file("methods.yml").read_text())["htr-ser"]
+    before = dict(method.methods())
+    with pytest.raises(ValueError, match=message):
+        method.register_method(**{"name": "mine", **block, **settings})
+    assert method.methods() == before
+
+
+def test_an_experiment(own_module: str, tmp_path: Path) -> None:
+    """A row of the grid, with a method of the same module."""
+    runs = ["--runs", str(tmp_path / "runs"), "-o", str(tmp_path / "results")]
+    (tmp_path / "runs").mkdir()
+    assert main(["experiment", "toy", "--gym-packages", own_module, "--cell", "0", *runs]) == 0
+    assert agent_at(tmp_path / "runs" / "toy" / "half-seed1").method == "half-half"
+    assert main(["experiment", "toy", "--gym-packages", own_module, *runs, "--jobs", "1"]) == 0, "nothing is left to run"
+    summary = json.loads((tmp_path / "results" / "summary.json").read_text())
+    assert {row["variant"] for row in summary["rows"]} == {"half"}
+    assert plt.imread(tmp_path / "results" / "toy.png").shape[:2] == (1, 1), "by its own figure, of one result"

@@ -41,6 +41,7 @@ class Cell:
     :param settings: hyperparameters, joined with those of env and method
     :param env_kwargs: arguments of the env
     :param evaluations: what is done with the final model; one row of results for each
+    :param gym_packages: modules that register what of this is not the package's own
     """
 
     experiment: str
@@ -54,6 +55,7 @@ class Cell:
     settings: KwArgs
     env_kwargs: KwArgs
     evaluations: tuple[Evaluation, ...]
+    gym_packages: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -88,4 +90,5 @@ class Cell:
             *("--seed", str(self.seed), "--eval-freq", str(self.eval_freq)),
             *(["-params", *settings] if settings else []),
             *(["--env-kwargs", *kwargs] if kwargs else []),
+            *(["--gym-packages", *self.gym_packages] if self.gym_packages else []),
         ]

@@ -13,11 +13,8 @@ from sb3_htr.experiments.protocol import scores
 from sb3_htr.zoo.plots.curves import band, finish
 from sb3_htr.zoo.plots.intervals import iqm_interval
 from sb3_htr.zoo.plots.style import COLOURS, curve_styles, save
-from sb3_htr.zoo.run.method import OWN
 
 Results = dict[Cell, Path]
-# Of the explorers in the picture, in the env of the training: without settings of another one, an evaluation's name is theirs
-STYLES = {"belief": "-", OWN: "-", "prior": "--"}
 
 
 def by_variant(results: Results) -> dict[str, list[tuple[Cell, Any]]]:
@@ -41,7 +38,8 @@ def n_seeds(results: Results) -> int:
 
 def learning(results: Results, path: Path) -> None:
     """
-    Left: learning curves on validation tasks. Right: the final models' adaptation to the test tasks.
+    Left: learning curves on validation tasks. Right: the final models' adaptation to the test tasks, by the first explorer of
+    each and by the prior.
 
     :param results: raw results of the cells
     :param path: picture to write
@@ -51,13 +49,11 @@ def learning(results: Results, path: Path) -> None:
     for (colour, _), (variant, runs) in zip(curve_styles([*groups]), groups.items(), strict=True):
         curve = np.stack([raw["curve"].mean(axis=1) for _, raw in runs])
         band(left, runs[0][1]["timesteps"] / 1000, curve, colour, "-", variant)
-        for evaluation in runs[0][0].evaluations:
-            if evaluation.name in STYLES:
-                returns, label = (
-                    np.stack([raw[f"returns_{evaluation.name}"] for _, raw in runs]),
-                    f"{variant}, {evaluation.name}",
-                )
-                band(right, np.arange(1, returns.shape[-1] + 1), returns, colour, STYLES[evaluation.name], label)
+        explorers = [evaluation.explorer for evaluation in runs[0][0].evaluations if not evaluation.tested_on]
+        styles = {"prior": "--", **dict.fromkeys(explorers[:1], "-")}
+        for explorer in [explorer for explorer in explorers if explorer in styles]:
+            returns = np.stack([raw[f"returns_{explorer}"] for _, raw in runs])
+            band(right, np.arange(1, returns.shape[-1] + 1), returns, colour, styles[explorer], f"{variant}, {explorer}")
     left.set_xlabel("thousand env steps of meta-training")
     left.set_ylabel("return of the last adaptation episode")
     left.set_title("validation tasks, during meta-training", fontsize=10)

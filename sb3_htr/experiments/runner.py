@@ -17,6 +17,7 @@ from sb3_htr.experiments.protocol import evaluate
 from sb3_htr.zoo.commands import train
 from sb3_htr.zoo.run.agents import RECORD, agent_at, file_stem, find_runs, read_record
 from sb3_htr.zoo.run.algorithm import Model
+from sb3_htr.zoo.run.trust import import_packages
 
 # Means over the training of what HTR paper, B.2 reasons with
 LOGGED = ("relabelled_fraction", "rl_reward_mean", "rl_zero_reward_fraction")
@@ -64,10 +65,12 @@ def run_cell(cell: Cell, runs: Path) -> bool:
 
 
 def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
+    import_packages(cell.gym_packages)
     trained = find_finished(cell, folder)
     if trained is None:
         unfinished = [run for run in folder.glob("*/*") if checkpoints(run)]
-        train.main(["--resume", str(unfinished[-1])] if unfinished else cell.training(folder))
+        packages = ["--gym-packages", *cell.gym_packages] if cell.gym_packages else []
+        train.main(["--resume", str(unfinished[-1]), *packages] if unfinished else cell.training(folder))
         trained = find_finished(cell, folder)
         if trained is None:
             raise KeyboardInterrupt

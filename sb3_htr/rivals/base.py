@@ -141,7 +141,7 @@ class Rival(AtomicSave, BaseAlgorithm):
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         if self.env is None:
-            raise ValueError("This model has no env to train in: pass env=... to load, or call set_env.")
+            raise ValueError("The model was loaded without an env, which learning needs: pass env to load, or call set_env.")
         result = super()._setup_learn(*args, **kwargs)
         if self._pending_random is not None:
             set_random_state(self.env, self._pending_random)

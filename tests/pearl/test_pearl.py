@@ -48,6 +48,7 @@ class Counter(BaseCallback):
         {"target_update_interval": 2, "explorer": PRIOR, "train_explorer": PRIOR},
         {"train_explorer": "belief"},
         {"policy_kwargs": with_policy(normalize_observations=False)},
+        {"reward_coef": 0.0},
         {"replay_buffer_kwargs": {"relabel_probability": 0.0, "rl_reward_type": "dense"}},
         {"replay_buffer_kwargs": {"relabeller": {"name": "SingleEpisodeRelabelling", "hindsight_task_strategy": "final"}}},
         {"replay_buffer_kwargs": {"relabel_probability": 1.0, "relabeller": EpisodeClustering()}},
@@ -60,13 +61,13 @@ def test_learn_changes_every_network(tiny_pearl: MakePEARL, kwargs: dict[str, An
     assert model.num_timesteps == 2 * ROLLOUT
     assert model._n_updates == 2 * 3
     after = parameters(model)
-    for network in ("actor.", "critic.", "critic_target.", "encoder.", "knowledge."):
+    for network in ("actor.", "critic.", "critic_target.", "encoder.", "reward_model.", "knowledge."):
         assert any(not th.equal(before[name], after[name]) for name in before if name.startswith(network)), network
 
 
 def test_the_actor_does_not_shape_z(tiny_pearl: MakePEARL) -> None:
     """It sees z detached: where neither critics nor reward model ask for it and the KL term is off, there is no gradient."""
-    model = tiny_pearl(kl_coef=0.0, reward_coef=0.0).learn(2 * ROLLOUT)
+    model = tiny_pearl(kl_coef=0.0, reward_coef=0.0, learning_rate=1e-3).learn(2 * ROLLOUT)
     obs_dim, latent_dim = 2, model.policy.latent_dim
     with th.no_grad():
         for network in (*model.critic.networks, *model.critic_target.networks):
@@ -238,6 +239,8 @@ def test_loading_for_prediction_stores_nothing_and_an_env_can_come_later(tiny_pe
     tiny_pearl().learn(ROLLOUT).save(tmp_path / "model.zip")
     loaded = PEARL.load(tmp_path / "model.zip")
     assert loaded.replay_buffer is None
+    with pytest.raises(ValueError, match=r"without an env.*set_env"):
+        loaded.learn()
     loaded.set_env(make_task_vec_env(ENV_ID, 4))
     loaded.learn(ROLLOUT)
 

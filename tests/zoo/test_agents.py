@@ -68,7 +68,7 @@ def test_agents_that_are_not_there_are_said_to_be_so(tmp_path: Path, tiny_pearl:
         ([*NOWHERE, "--device", "cudaa"], "The device 'cudaa' cannot be used: give cpu, cuda or cuda:N"),
         ([str(SHIPPED), "--env", "SparseAnt-v0"], "was trained on SparsePointRobot-v0, but --env is SparseAnt-v0"),
         ([*NOWHERE, "--n-episodes", "0"], "--n-episodes is 0, expected a whole number of at least 1"),
-        ([*NOWHERE, "--gym-packages", "no_such_module"], "The env needs the module no_such_module"),
+        ([*NOWHERE, "--gym-packages", "no_such_module"], "The module no_such_module is asked for, but not found"),
     ):
         with pytest.raises((ValueError, FileNotFoundError), match=message):
             main(["enjoy", "--no-render", *arguments])

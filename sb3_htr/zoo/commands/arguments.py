@@ -13,6 +13,7 @@ from sb3_htr.zoo.run.agents import TrainedAgent, agent_at, agent_for
 from sb3_htr.zoo.run.trust import import_packages, refuse
 
 TASK_SETS = ("test", "validation", "train")
+OF_PACKAGES = "modules of your own that register envs, methods or experiments"
 
 
 class KeyValues(argparse.Action):
@@ -31,18 +32,22 @@ class KeyValues(argparse.Action):
         setattr(namespace, self.dest, pairs)
 
 
-def make_parser(command: str, description: str, example: str) -> argparse.ArgumentParser:
+def make_parser(
+    command: str, description: str, example: str, parents: Sequence[argparse.ArgumentParser] = ()
+) -> argparse.ArgumentParser:
     """
     :param command: name of the command
     :param description: what it does
     :param example: command lines
-    :return: parser without arguments
+    :param parents: parsers whose arguments it has
+    :return: parser without other arguments
     """
     return argparse.ArgumentParser(
         prog=f"sb3-htr {command}",
         description=description,
         epilog=f"examples:\n{example}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
+        parents=parents,
     )
 
 
@@ -62,7 +67,7 @@ def add_agent_arguments(parser: argparse.ArgumentParser, several: bool = False) 
     group.add_argument("--method", metavar="NAME", help="method that it was trained by, such as htr-ec")
     group.add_argument("--model", choices=["best", "last"], default="best", help="of a run: best on validation tasks, or last")
     group.add_argument("--load-best", dest="model", action="store_const", const="best", help="the same as --model best")
-    group.add_argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules that register envs")
+    group.add_argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help=OF_PACKAGES)
     group.add_argument(
         "--env-kwargs", nargs="+", action=KeyValues, default={}, metavar="KEY:VALUE", help="change arguments of the env"
     )
@@ -78,7 +83,8 @@ def add_adaptation_arguments(parser: argparse.ArgumentParser, n_episodes: int) -
     group = parser.add_argument_group("adaptation")
     group.add_argument("--tasks", choices=TASK_SETS, default="test", help="set of tasks to adapt to (default: test)")
     group.add_argument("--n-episodes", type=int, default=n_episodes, metavar="N", help=f"per task (default: {n_episodes})")
-    group.add_argument("--explorer", choices=list(EXPLORERS), help="by default the model's own")
+    explorers = f"{', '.join(EXPLORERS)}, or one of your own; by default the model's"
+    group.add_argument("--explorer", metavar="NAME", help=explorers)
     group.add_argument("--stochastic", action="store_true", help="sample actions instead of taking their mean")
     group.add_argument("--seed", type=int, default=0, help="of env and z (default: 0)")
 

@@ -1,12 +1,15 @@
 """``sb3-htr experiment``: repeat an experiment of this project, all its runs and its tables and pictures."""
 
+import argparse
 import importlib
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from sb3_htr.common.checks import check_numbers
-from sb3_htr.zoo.commands.arguments import make_parser
+from sb3_htr.zoo.commands.arguments import OF_PACKAGES, make_parser
+from sb3_htr.zoo.run.trust import import_packages
 
 EXAMPLE = """  sb3-htr experiment point_robot --jobs 2
   sb3-htr experiment ant --quick                        one seed, a tenth of the env steps: does it run?
@@ -19,8 +22,14 @@ def main(argv: Sequence[str]) -> None:
     driver, executors, grid, report = (
         importlib.import_module(f"sb3_htr.experiments.{name}") for name in ("driver", "executors", "grid", "report")
     )
+    own = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    own.add_argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help=OF_PACKAGES)
+    # Before the names of experiments are asked for
+    packages = own.parse_known_args(argv)[0].gym_packages
+    import_packages(packages)
     names = "\n".join(f"  {name:<16} {experiment.env_id}: {experiment.about}" for name, experiment in grid.EXPERIMENTS.items())
-    parser = make_parser("experiment", f"Repeat an experiment; a killed one goes on where it stopped.\n\n{names}", EXAMPLE)
+    about = f"Repeat an experiment; a killed one goes on where it stopped.\n\n{names}"
+    parser = make_parser("experiment", about, EXAMPLE, parents=[own])
     parser.add_argument("name", choices=list(grid.EXPERIMENTS), metavar="NAME", help="one of the above")
     parser.add_argument("--seeds", type=int, help="runs of each variant (default: those of the experiment)")
     parser.add_argument("--quick", action="store_true", help="one seed, a tenth of the env steps")
@@ -36,6 +45,7 @@ def main(argv: Sequence[str]) -> None:
     check_numbers(**{name: (n, 1, float("inf")) for name, n in given.items() if n is not None})
     experiment = grid.EXPERIMENTS[args.name]
     cells = experiment.cells(1, 0.1) if args.quick else experiment.cells(args.seeds)
+    cells = [replace(cell, gym_packages=tuple(packages)) for cell in cells]
     if args.cell is not None and not 0 <= args.cell < len(cells):
         raise ValueError(f"--cell is {args.cell}, expected 0 to {len(cells) - 1}: the experiment has {len(cells)} runs.")
     quick = "quick-" if args.quick else ""

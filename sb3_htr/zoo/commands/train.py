@@ -52,6 +52,8 @@ def main(argv: Sequence[str]) -> None:
     program = "sb3-htr optimize" if "-optimize" in rest else "sb3-htr train"
     if wants_help and "-optimize" not in rest:
         print(HELP)
+    # Before anything else: they may bring the method, too
+    import_packages(args.gym_packages)
     algorithm = get_method(args.method or DEFAULT).algorithm
     if args.algo not in (None, algorithm.name):
         raise ValueError(
@@ -75,11 +77,11 @@ def main(argv: Sequence[str]) -> None:
         if n_steps_done(run) >= planned and (run / f"{file_stem(record['env_id'])}.zip").exists():
             print(f"{run} is finished, after {planned:,} env steps. To train further: sb3-htr train --resume {run} -n STEPS")
             return
-        arguments, args.method = [*record["arguments"], "--seed", str(record["seed"])], record["method"]
-        algorithm = get_method(args.method).algorithm
-        arguments += ["-n", str(planned)]
+        arguments = [*record["arguments"], "--seed", str(record["seed"]), "-n", str(planned)]
         check_arguments(arguments, record["gym_packages"], run / RECORD, args.trust)
         import_packages(args.gym_packages, record["gym_packages"], run / RECORD, args.trust)
+        args.method = record["method"]
+        algorithm = get_method(args.method).algorithm
         find_hidden(record["env_id"])
     else:
         if not wants_help and not env:
@@ -91,7 +93,6 @@ def main(argv: Sequence[str]) -> None:
             if before in CONF and Path(word).exists():
                 rest[rest.index(word)] = str(Path(word).resolve())  # wherever the run goes on from
         arguments = [*defaults, *env, *rest, *packages]
-        import_packages(args.gym_packages)
         find_hidden(args.env or "")
     keep_freed_memory()
     try:

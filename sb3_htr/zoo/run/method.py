@@ -1,11 +1,13 @@
 """What is compared: a method, by one name."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
 import yaml
 
+from sb3_htr.adaptation.explorers import EXPLORERS
 from sb3_htr.common.checks import keywords_of
 from sb3_htr.htr.relabel import RELABELLERS
 from sb3_htr.rivals.base import OwnWay
@@ -131,6 +133,38 @@ def methods() -> dict[str, Method]:
 def _method(name: str, label: str, about: str = "", algorithm: str = "pearl", **settings: Any) -> Method:
     kind = PEARLMethod if algorithm == "pearl" else Method
     return kind(name, label, " ".join(about.split()), algorithm, **settings)
+
+
+def register_method(name: str, **settings: Any) -> None:
+    """
+    Add a method, and the same under PEARL's own protocol, to those of ``hyperparams/methods.yml``. In a module of one's own,
+    which ``--gym-packages`` names, it is at hand in all commands.
+
+    :param name: that no other method has
+    :param settings: what a block of ``hyperparams/methods.yml`` says: ``label``, ``about``, ``algorithm``, and for PEARL what
+        :class:`PEARLMethod` has
+    :raises ValueError: for a name that is taken, settings that are missing or not there, or an unknown relabeller, explorer
+        or algorithm
+    """
+    if name in methods():
+        raise ValueError(f"There is a method {name!r} already: choose another name.")
+    try:
+        method = _method(name, **settings)
+    except TypeError as error:
+        raise ValueError(f"The method {name!r} is not whole, see hyperparams/methods.yml: {error}.") from None
+    kinds: dict[str, Iterable[str]] = {
+        "algorithm_name": ALGORITHMS,
+        "relabeller": RELABELLERS,
+        "train_explorer": EXPLORERS,
+        "explorer": EXPLORERS,
+    }
+    for setting, known in kinds.items():
+        value = getattr(method, setting, None)
+        if value is not None and value not in known:
+            raise ValueError(f"The {setting} of the method {name!r} is {value!r}, expected one of {sorted(known)}.")
+    methods()[name] = method
+    if isinstance(method, PEARLMethod):
+        methods()[f"{name}{PRIOR}"] = method.under_prior()
 
 
 def get_method(name: str) -> Method:

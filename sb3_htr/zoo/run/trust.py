@@ -120,5 +120,5 @@ def import_packages(named: Iterable[str], asked_for: Iterable[str] = (), file: o
             if error.name != name.split(".")[0]:
                 raise
             raise ValueError(
-                f"The env needs the module {name}, which is not found: install it, or add its folder to PYTHONPATH."
+                f"The module {name} is asked for, but not found: install it, or add its folder to PYTHONPATH."
             ) from None
