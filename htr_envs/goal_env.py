@@ -181,6 +181,7 @@ class HiddenGoalEnv(TaskEnv):
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 25}  # type: ignore[misc]
+    task_family: HiddenGoalFamily
 
     def __init__(
         self,
@@ -190,10 +191,8 @@ class HiddenGoalEnv(TaskEnv):
         render_mode: str | None = None,
         **task_sets: Any,
     ) -> None:
-        family = HiddenGoalFamily(env_id, env_kwargs, **task_sets)
-        super().__init__(family, reward_type)
-        self._family = family
-        env = probe(family.source)
+        super().__init__(HiddenGoalFamily(env_id, env_kwargs, **task_sets), reward_type)
+        env = probe(self.task_family.source)
         assert isinstance(env.observation_space, spaces.Dict) and isinstance(env.action_space, spaces.Box)
         # whatever bounds the env gives: not all keep them, and rounded to float32 they are others
         first = self._observe(env.observation_space.sample())
@@ -216,17 +215,17 @@ class HiddenGoalEnv(TaskEnv):
         # each start is drawn by our generator alone, so that its state is all there is to resume from
         self._seed, self._actions, self._n_shown = int(self.np_random.integers(2**31)), [], NOT_BEGUN
         if self._env is None:
-            self._env = self._family.source.make()
+            self._env = self.task_family.source.make()
         observation, _ = self._env.reset(seed=self._seed)
         return self._observe(observation)
 
     def _step_state(self, action: FloatArray) -> tuple[FloatArray, float, bool]:
         if self._env is None:
-            self._env = self._family.source.make()
+            self._env = self.task_family.source.make()
             self._follow(self._env, NOT_BEGUN)
         self._actions.append(np.clip(action, self.action_space.low, self.action_space.high))
         observation, _, terminated, _, _ = self._env.step(self._actions[-1].copy())
-        own_end = terminated and self._family.reached(observation["achieved_goal"], observation["desired_goal"])
+        own_end = terminated and self.task_family.reached(observation["achieved_goal"], observation["desired_goal"])
         return self._observe(observation), 0.0, bool(terminated and not own_end)
 
     def _follow(self, env: gym.Env[Any, Any], n_steps: int) -> None:
@@ -251,7 +250,7 @@ class HiddenGoalEnv(TaskEnv):
         goal = self.task
         if self._picture is None:
             open_no_window()
-            self._picture, self._n_shown = self._family.source.make(render_mode=self.render_mode), NOT_BEGUN
+            self._picture, self._n_shown = self.task_family.source.make(render_mode=self.render_mode), NOT_BEGUN
         self._follow(self._picture, self._n_shown)
         self._n_shown = len(self._actions)
         _show_goal(self._picture.unwrapped, goal)

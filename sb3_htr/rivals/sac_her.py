@@ -186,10 +186,11 @@ class SACHER(Rival, SAC):
         self.replay_buffer.truncate_last_trajectory()
 
     def collect_rollouts(self, env: VecEnv, callback: BaseCallback, *args: Any, **kwargs: Any) -> RolloutReturn:
-        """As SAC's, logged rollout by rollout instead of episode by episode."""
+        """As SAC's, but ``log_interval`` counts rollouts instead of episodes."""
         log_interval = kwargs.pop("log_interval", None)
         rollout = super().collect_rollouts(env, callback, *args, **kwargs)
-        if log_interval is not None and rollout.continue_training:
+        n_rollouts = self.num_timesteps // (self.n_envs * self.train_freq.frequency)  # type: ignore[union-attr]
+        if log_interval is not None and rollout.continue_training and n_rollouts % log_interval == 0:
             self.dump_logs()
         return rollout
 

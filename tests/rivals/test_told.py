@@ -94,6 +94,14 @@ def test_another_env_brings_its_task_family_unless_there_is_experience() -> None
     assert model.learn(80).num_timesteps == 80
 
 
+@pytest.mark.parametrize(("log_interval", "n_logs"), [(1, 4), (2, 2), (None, 0)])
+def test_logs_are_so_many_rollouts_apart(log_interval: Any, n_logs: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, logs = tiny_sac_her(), list[int]()
+    monkeypatch.setattr(model, "dump_logs", lambda: logs.append(model.num_timesteps))
+    model.learn(320, log_interval=log_interval)
+    assert len(logs) == n_logs and logs[-1:] == [320] * (n_logs > 0)
+
+
 def test_episodes_that_end_early_are_nothing_to_warn_of(recwarn: pytest.WarningsRecorder) -> None:
     """A rollout then ends within episodes."""
     model = tiny_sac_her(BatchedTaskVecEnv(DynamicsVectorEnv(PointRobotFamily(), FallingDynamics(4), max_episode_steps=20)))
