@@ -51,35 +51,21 @@ class HiddenGoalFamily(TaskFamily):
         super().__init__(task_space, goals.train, goals.validation, goals.test)
 
     def sample_tasks(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Have the env draw goals.
-
-        :param n: how many tasks.
-        :param rng: the only source of randomness.
-        :return: goals, shape (n, goal_dim).
-        """
+        """Have the env draw goals."""
         return np.stack([draw_goal(self.source, int(seed)) for seed in rng.integers(2**31, size=n)])
 
     def compute_reward(self, traj: Trajectory, task: ArrayLike, reward_type: str = "sparse") -> FloatArray:
         """Goal reward plus task-free reward of every step.
 
-        :param traj: the steps, arrays of shape (..., T, dim).
-        :param task: the goal, shape (..., goal_dim); its leading axes broadcast with those of ``traj``.
         :param reward_type: ``"sparse"``: 1 where the goal is reached, else 0. ``"dense"``: the env's own dense reward, or
             minus the distance to the goal where it has no argument ``reward_type``.
-        :return: rewards, shape (..., T), float32.
-        :raises ValueError: if the reward type is unknown.
         """
         check_reward_type(reward_type)
         goal_reward = self._dense_reward(traj, task) if reward_type == "dense" else self.is_success(traj, task)
         return np.asarray(goal_reward + traj.task_free_reward, dtype=np.float32)
 
     def is_success(self, traj: Trajectory, task: ArrayLike) -> BoolArray:
-        """Whether the next state of every step is at the goal, by the env's own reward.
-
-        :param traj: the steps, arrays of shape (..., T, dim).
-        :param task: the goal, shape (..., goal_dim); its leading axes broadcast with those of ``traj``.
-        :return: successes, shape (..., T).
-        """
+        """Whether the next state of every step is at the goal, by the env's own reward."""
         return self.reached(*self._goals(traj, task))
 
     def reached(self, achieved_goals: ArrayLike, goals: ArrayLike) -> BoolArray:
@@ -92,12 +78,7 @@ class HiddenGoalFamily(TaskFamily):
         return np.asarray(goal_rewards(self.source, achieved_goals, goals) > self.failure_reward)
 
     def hindsight_task(self, traj: Trajectory, index: ArrayLike) -> FloatArray:
-        """The goal that is achieved after one step.
-
-        :param traj: the steps, arrays of shape (..., T, dim).
-        :param index: which step, an int or an int array that broadcasts with the leading axes of ``traj``.
-        :return: goals, shape (..., goal_dim), float32, sharing no memory with ``traj``.
-        """
+        """The goal that is achieved after one step."""
         return at_step(self._achieved(traj), index)
 
     def _achieved(self, traj: Trajectory) -> FloatArray:

@@ -1,6 +1,6 @@
 """What the rivals share: they train on the envs of PEARL, are evaluated as PEARL is, and go on from the same checkpoints."""
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -26,9 +26,9 @@ class OwnWay:
     name = "own"
 
 
-class RivalAdaptation:
+class RivalAdaptation(ABC):
     """
-    Keeps what anybody can see of an adaptation; a subclass adds ``act``.
+    Keeps what anybody can see of an adaptation; a subclass says how to act.
 
     :param n_envs: number of tasks
     """
@@ -36,6 +36,14 @@ class RivalAdaptation:
     def __init__(self, n_envs: int) -> None:
         self.n_envs = n_envs
         self._found = np.zeros(n_envs, dtype=bool)
+
+    @abstractmethod
+    def act(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
+        """
+        :param obs: (n_envs, obs_dim)
+        :param deterministic: mean actions instead of samples
+        :return: (n_envs, action_dim), scaled to [-1, 1]
+        """
 
     def observe(self, step: Step) -> None:
         """
@@ -76,11 +84,6 @@ class ToldAdaptation(RivalAdaptation):
         self._tasks = tasks
 
     def act(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
-        """
-        :param obs: (n_envs, obs_dim)
-        :param deterministic: mean actions instead of samples
-        :return: (n_envs, action_dim), scaled to [-1, 1]
-        """
         return self._act(obs, self._tasks, deterministic)
 
 

@@ -44,11 +44,6 @@ class TrialAdaptation(RivalAdaptation):
         self._kept_memory, self._kept_last = self._memory.copy(), self._last.columns.copy()
 
     def act(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
-        """
-        :param obs: (n_envs, obs_dim)
-        :param deterministic: mean actions instead of samples
-        :return: (n_envs, action_dim), scaled to [-1, 1]
-        """
         begins = np.zeros(self.n_envs, dtype=bool)
         actions, memory = self.policy.predict(
             self._last.beside(obs), (self._memory[0], self._memory[1]), begins, deterministic
@@ -58,9 +53,6 @@ class TrialAdaptation(RivalAdaptation):
         return self.policy.scale_action(actions)
 
     def observe(self, step: Step) -> None:
-        """
-        :param step: what each env did
-        """
         super().observe(step)
         self._last.take_in(step.actions, step.rewards, step.dones)
         ended = np.flatnonzero(step.dones)

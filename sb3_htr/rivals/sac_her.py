@@ -180,7 +180,6 @@ class SACHER(Rival, SAC):
         self._setup_replay(vec_env)
 
     def begin_rollout(self) -> None:
-        """Begin new episodes in all envs."""
         super().begin_rollout()
         assert isinstance(self.replay_buffer, TaskHerReplayBuffer)
         self.replay_buffer.truncate_last_trajectory()
@@ -195,18 +194,10 @@ class SACHER(Rival, SAC):
         return rollout
 
     def state_dict(self) -> dict[str, Any]:
-        """
-        :return: everything that a training in progress is, between two rollouts, for :meth:`load_state_dict`
-        """
         assert isinstance(self.replay_buffer, TaskHerReplayBuffer)
         return {**super().state_dict(), "replay": self.replay_buffer.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """
-        The random generators follow when ``learn(remaining steps, reset_num_timesteps=False)`` begins.
-
-        :param state: of :meth:`state_dict` of a model with the same settings
-        """
         super().load_state_dict(state)
         assert isinstance(self.replay_buffer, TaskHerReplayBuffer)
         self.replay_buffer.load_state_dict(state["replay"])
