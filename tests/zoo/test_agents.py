@@ -181,6 +181,12 @@ def test_the_console_answers_mistakes_in_one_sentence(
     with pytest.raises(ValueError):
         cli.console()
 
+    def interrupt(argv: object = None) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "main", interrupt)
+    assert cli.console() == 130 and "stopped" in capsys.readouterr().err
+
 
 @pytest.mark.parametrize("command", cli.COMMANDS)
 def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]) -> None:
