@@ -21,7 +21,7 @@ PARTS = {
     "stepping the envs": "env.step",
     "choosing actions": "policy.act",
     "best episodes of training tasks": "task_bank.update",
-    "known tasks": "_learn_knowledge",
+    "what explorers start from": "_learn_knowledge",
     "Python between the operations of updates": "_update",
 }
 

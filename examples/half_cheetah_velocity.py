@@ -72,21 +72,11 @@ gym.register("HalfCheetahVelocity-v0", entry_point=HalfCheetahVelocityEnv, max_e
 
 
 if __name__ == "__main__":
-    from sb3_htr import PEARL, evaluate_adaptation, make_task_vec_env
+    from sb3_htr import PEARL, evaluate_adaptation
 
-    env = make_task_vec_env("HalfCheetahVelocity-v0", n_envs=20, seed=0)
     # One episode with a z of the prior, then of the posterior
     prior = {"name": "prior", "n_exploration_episodes": 1}
-    model = PEARL(
-        "MlpPolicy",
-        env,
-        replay_buffer_kwargs={"relabel_probability": 0.0},
-        explorer=prior,
-        train_explorer=prior,
-        n_episodes_per_task=3,
-        context_size=100,
-        seed=0,
-        verbose=1,
-    ).learn(1_000_000)
-    returns, _ = evaluate_adaptation(model, env, n_episodes=3)
+    plain = {"replay_buffer_kwargs": {"relabel_probability": 0.0}, "explorer": prior, "train_explorer": prior}
+    model = PEARL("MlpPolicy", "HalfCheetahVelocity-v0", **plain, n_episodes_per_task=3, context_size=100, seed=0, verbose=1)
+    returns, _ = evaluate_adaptation(model.learn(1_000_000), "HalfCheetahVelocity-v0", n_episodes=3)
     print(f"return of episodes 1 to 3: {returns.mean(axis=0).round(1)}")

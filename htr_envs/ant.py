@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 import gymnasium
 import numpy as np
 
-from htr_envs.dynamics import DynamicsEnv, DynamicsVectorEnv
-from htr_envs.mujoco_dynamics import DoubleArray, MujocoDynamics, mujoco  # which says so where MuJoCo is missing
+from htr_envs.dynamics import DynamicsEnv
+from htr_envs.mujoco_dynamics import DoubleArray, MujocoDynamics, MujocoVectorEnv, mujoco  # says so where MuJoCo is missing
 from htr_envs.semicircle_goals import LOCOMOTION_ARENA, LocomotionFamily
 from htr_envs.task_env import BoolArray, FloatArray
 
@@ -247,23 +247,7 @@ class AntEnv(DynamicsEnv):
         super().__init__(*_ants(1, 1, **kwargs), reward_type, render_mode)
 
 
-class AntVectorEnv(DynamicsVectorEnv):
-    """Many ants that step together, in native threads; see :class:`AntEnv` for what they do.
+class AntVectorEnv(MujocoVectorEnv):
+    """Many ants that step together, in native threads; see :class:`AntEnv` for what they do."""
 
-    :param num_envs: how many ants.
-    :param max_episode_steps: steps after which an episode is truncated, None for never.
-    :param reward_type: reward of ``step``, ``"sparse"`` or ``"dense"``.
-    :param n_threads: how many threads step the ants; the results do not depend on it. None for ``OMP_NUM_THREADS`` if that
-        is set, else one for each CPU that this process may use, but for no more than have enough to do.
-    :param kwargs: the other arguments of :class:`AntEnv`, but for ``render_mode``.
-    """
-
-    def __init__(
-        self,
-        num_envs: int = 1,
-        max_episode_steps: int | None = 200,
-        reward_type: str = "sparse",
-        n_threads: int | None = None,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(*_ants(num_envs, n_threads, **kwargs), max_episode_steps, reward_type)
+    make = staticmethod(_ants)

@@ -51,35 +51,21 @@ class HiddenGoalFamily(TaskFamily):
         super().__init__(task_space, goals.train, goals.validation, goals.test)
 
     def sample_tasks(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Have the env draw goals.
-
-        :param n: how many tasks.
-        :param rng: the only source of randomness.
-        :return: goals, shape (n, goal_dim).
-        """
+        """Have the env draw goals."""
         return np.stack([draw_goal(self.source, int(seed)) for seed in rng.integers(2**31, size=n)])
 
     def compute_reward(self, traj: Trajectory, task: ArrayLike, reward_type: str = "sparse") -> FloatArray:
         """Goal reward plus task-free reward of every step.
 
-        :param traj: the steps, arrays of shape (..., T, dim).
-        :param task: the goal, shape (..., goal_dim); its leading axes broadcast with those of ``traj``.
         :param reward_type: ``"sparse"``: 1 where the goal is reached, else 0. ``"dense"``: the env's own dense reward, or
             minus the distance to the goal where it has no argument ``reward_type``.
-        :return: rewards, shape (..., T), float32.
-        :raises ValueError: if the reward type is unknown.
         """
         check_reward_type(reward_type)
         goal_reward = self._dense_reward(traj, task) if reward_type == "dense" else self.is_success(traj, task)
         return np.asarray(goal_reward + traj.task_free_reward, dtype=np.float32)
 
     def is_success(self, traj: Trajectory, task: ArrayLike) -> BoolArray:
-        """Whether the next state of every step is at the goal, by the env's own reward.
-
-        :param traj: the steps, arrays of shape (..., T, dim).
-        :param task: the goal, shape (..., goal_dim); its leading axes broadcast with those of ``traj``.
-        :return: successes, shape (..., T).
-        """
+        """Whether the next state of every step is at the goal, by the env's own reward."""
         return self.reached(*self._goals(traj, task))
 
     def reached(self, achieved_goals: ArrayLike, goals: ArrayLike) -> BoolArray:
@@ -92,12 +78,7 @@ class HiddenGoalFamily(TaskFamily):
         return np.asarray(goal_rewards(self.source, achieved_goals, goals) > self.failure_reward)
 
     def hindsight_task(self, traj: Trajectory, index: ArrayLike) -> FloatArray:
-        """The goal that is achieved after one step.
-
-        :param traj: the steps, arrays of shape (..., T, dim).
-        :param index: which step, an int or an int array that broadcasts with the leading axes of ``traj``.
-        :return: goals, shape (..., goal_dim), float32, sharing no memory with ``traj``.
-        """
+        """The goal that is achieved after one step."""
         return at_step(self._achieved(traj), index)
 
     def _achieved(self, traj: Trajectory) -> FloatArray:
@@ -181,6 +162,7 @@ class HiddenGoalEnv(TaskEnv):
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 25}  # type: ignore[misc]
+    task_family: HiddenGoalFamily
 
     def __init__(
         self,
@@ -190,10 +172,8 @@ class HiddenGoalEnv(TaskEnv):
         render_mode: str | None = None,
         **task_sets: Any,
     ) -> None:
-        family = HiddenGoalFamily(env_id, env_kwargs, **task_sets)
-        super().__init__(family, reward_type)
-        self._family = family
-        env = probe(family.source)
+        super().__init__(HiddenGoalFamily(env_id, env_kwargs, **task_sets), reward_type)
+        env = probe(self.task_family.source)
         assert isinstance(env.observation_space, spaces.Dict) and isinstance(env.action_space, spaces.Box)
         # whatever bounds the env gives: not all keep them, and rounded to float32 they are others
         first = self._observe(env.observation_space.sample())
@@ -216,17 +196,17 @@ class HiddenGoalEnv(TaskEnv):
         # each start is drawn by our generator alone, so that its state is all there is to resume from
         self._seed, self._actions, self._n_shown = int(self.np_random.integers(2**31)), [], NOT_BEGUN
         if self._env is None:
-            self._env = self._family.source.make()
+            self._env = self.task_family.source.make()
         observation, _ = self._env.reset(seed=self._seed)
         return self._observe(observation)
 
     def _step_state(self, action: FloatArray) -> tuple[FloatArray, float, bool]:
         if self._env is None:
-            self._env = self._family.source.make()
+            self._env = self.task_family.source.make()
             self._follow(self._env, NOT_BEGUN)
         self._actions.append(np.clip(action, self.action_space.low, self.action_space.high))
         observation, _, terminated, _, _ = self._env.step(self._actions[-1].copy())
-        own_end = terminated and self._family.reached(observation["achieved_goal"], observation["desired_goal"])
+        own_end = terminated and self.task_family.reached(observation["achieved_goal"], observation["desired_goal"])
         return self._observe(observation), 0.0, bool(terminated and not own_end)
 
     def _follow(self, env: gym.Env[Any, Any], n_steps: int) -> None:
@@ -251,7 +231,7 @@ class HiddenGoalEnv(TaskEnv):
         goal = self.task
         if self._picture is None:
             open_no_window()
-            self._picture, self._n_shown = self._family.source.make(render_mode=self.render_mode), NOT_BEGUN
+            self._picture, self._n_shown = self.task_family.source.make(render_mode=self.render_mode), NOT_BEGUN
         self._follow(self._picture, self._n_shown)
         self._n_shown = len(self._actions)
         _show_goal(self._picture.unwrapped, goal)

@@ -63,12 +63,7 @@ class MetaWorldGoalEnv(gym.Env[dict[str, DoubleArray], NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, DoubleArray], dict[str, Any]]:
-        """Start an episode.
-
-        :param seed: seed of the env's generator, None to go on with it.
-        :param options: none.
-        :return: first observation and an empty info.
-        """
+        """Start an episode, with positions of its own."""
         super().reset(seed=seed)
         if seed is not None:
             self._env.seed(seed)
@@ -76,11 +71,7 @@ class MetaWorldGoalEnv(gym.Env[dict[str, DoubleArray], NDArray[np.float32]]):
         return self._split(observation), {}
 
     def step(self, action: NDArray[np.float32]) -> tuple[dict[str, DoubleArray], float, bool, bool, dict[str, Any]]:
-        """Do one step.
-
-        :param action: movement of the hand and effort of the gripper, shape (4,).
-        :return: observation, reward, False, False, info of Meta-World.
-        """
+        """Do one step, by a movement of the hand and an effort of the gripper, shape (4,)."""
         state, _, _, _, info = self._env.step(action)
         observation = self._split(state)
         reward = self.compute_reward(observation["achieved_goal"], observation["desired_goal"], info)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -15,7 +16,7 @@ from gymnasium import spaces
 from gymnasium.error import DependencyNotInstalled
 from numpy.typing import NDArray
 
-from htr_envs.dynamics import Dynamics
+from htr_envs.dynamics import Dynamics, DynamicsVectorEnv
 from htr_envs.headless import open_no_window
 from htr_envs.semicircle_goals import SemicircleGoalFamily
 from htr_envs.task_env import BoolArray, FloatArray
@@ -218,6 +219,31 @@ class MujocoDynamics(Dynamics[SemicircleGoalFamily]):
     @abstractmethod
     def _is_healthy(self, states: DoubleArray) -> BoolArray:
         """Which states may go on, shape (n,)."""
+
+
+class MujocoVectorEnv(DynamicsVectorEnv):
+    """Many robots that step together, in native threads.
+
+    :param num_envs: how many robots.
+    :param max_episode_steps: steps after which an episode is truncated, None for never.
+    :param reward_type: reward of ``step``, ``"sparse"`` or ``"dense"``.
+    :param n_threads: how many threads step the robots; the results do not depend on it. None for ``OMP_NUM_THREADS`` if that
+        is set, else one for each CPU that this process may use, but for no more than have enough to do.
+    :param kwargs: the other arguments of the single env, but for ``render_mode``.
+    """
+
+    make: ClassVar[Callable[..., tuple[SemicircleGoalFamily, MujocoDynamics]]]
+    """Of num_envs, n_threads and kwargs."""
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        max_episode_steps: int | None = 200,
+        reward_type: str = "sparse",
+        n_threads: int | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(*self.make(num_envs, n_threads, **kwargs), max_episode_steps, reward_type)
 
 
 def _add_discs(spec: mujoco.MjSpec) -> None:

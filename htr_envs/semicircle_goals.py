@@ -81,22 +81,13 @@ class SemicircleGoalFamily(TaskFamily):
         return np.float32(1.0) - distance
 
     def sample_tasks(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Draw goals at uniform angles.
-
-        :param n: how many tasks.
-        :param rng: the only source of randomness.
-        :return: goals, shape (n, 2).
-        """
+        """Draw goals at uniform angles."""
         return self._goals(rng.uniform(0.0, np.pi, n))
 
     def compute_reward(self, traj: Trajectory, task: ArrayLike, reward_type: str = "sparse") -> FloatArray:
         """Goal reward plus task-free reward of every step.
 
-        :param traj: the steps, arrays of shape (..., T, dim).
-        :param task: the goal, shape (..., 2); its leading axes broadcast with those of ``traj``.
         :param reward_type: ``"sparse"``: 0 for the goal where it is not reached. ``"dense"``: minus the distance to the goal.
-        :return: rewards, shape (..., T), float32.
-        :raises ValueError: if the reward type is unknown.
         """
         check_reward_type(reward_type)
         distance = self._distance(traj, task)
@@ -107,21 +98,11 @@ class SemicircleGoalFamily(TaskFamily):
         return np.asarray(goal_reward + traj.task_free_reward, dtype=np.float32)
 
     def is_success(self, traj: Trajectory, task: ArrayLike) -> BoolArray:
-        """Whether the next state of every step is within the goal radius.
-
-        :param traj: the steps, arrays of shape (..., T, dim).
-        :param task: the goal, shape (..., 2); its leading axes broadcast with those of ``traj``.
-        :return: successes, shape (..., T).
-        """
+        """Whether the next state of every step is within the goal radius."""
         return np.asarray(self._distance(traj, task) < self.goal_radius)
 
     def hindsight_task(self, traj: Trajectory, index: ArrayLike) -> FloatArray:
-        """The position after one step, which is the goal that this step reaches.
-
-        :param traj: the steps, arrays of shape (..., T, dim).
-        :param index: which step, an int or an int array that broadcasts with the leading axes of ``traj``.
-        :return: goals, shape (..., 2), float32, sharing no memory with ``traj``.
-        """
+        """The position after one step, which is the goal that this step reaches."""
         return at_step(traj.next_observations[..., :2], index)
 
 

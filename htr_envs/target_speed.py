@@ -64,43 +64,24 @@ class TargetSpeedFamily(TaskFamily):
         )
 
     def sample_tasks(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Draw speeds uniformly.
-
-        :param n: how many tasks.
-        :param rng: the only source of randomness.
-        :return: speeds, shape (n, 1).
-        """
+        """Draw speeds uniformly."""
         return rng.uniform(self.min_speed, self.max_speed, (n, 1)).astype(np.float32)
 
     def compute_reward(self, traj: Trajectory, task: ArrayLike, reward_type: str = "sparse") -> FloatArray:
         """Speed reward plus task-free reward of every step.
 
-        :param traj: the steps, arrays of shape (..., T, dim).
-        :param task: the speed, shape (..., 1); its leading axes broadcast with those of ``traj``.
         :param reward_type: ``"sparse"``: 1 where the speed is held. ``"dense"``: minus the difference to the speed.
-        :return: rewards, shape (..., T), float32.
-        :raises ValueError: if the reward type is unknown.
         """
         check_reward_type(reward_type)
         task_reward = -self._error(traj, task) if reward_type == "dense" else self.is_success(traj, task)
         return np.asarray(task_reward + traj.task_free_reward, dtype=np.float32)
 
     def is_success(self, traj: Trajectory, task: ArrayLike) -> BoolArray:
-        """Whether the next state of every step has the speed.
-
-        :param traj: the steps, arrays of shape (..., T, dim).
-        :param task: the speed, shape (..., 1); its leading axes broadcast with those of ``traj``.
-        :return: successes, shape (..., T).
-        """
+        """Whether the next state of every step has the speed."""
         return np.asarray(self._error(traj, task) < np.float32(self.tolerance))
 
     def hindsight_task(self, traj: Trajectory, index: ArrayLike) -> FloatArray:
-        """The speed after one step.
-
-        :param traj: the steps, arrays of shape (..., T, dim).
-        :param index: which step, an int or an int array that broadcasts with the leading axes of ``traj``.
-        :return: speeds, shape (..., 1), float32, sharing no memory with ``traj``.
-        """
+        """The speed after one step."""
         return self._speed(at_step(traj.next_observations, index))[..., None]
 
     @staticmethod

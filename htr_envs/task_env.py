@@ -211,21 +211,9 @@ class TaskEnv(MetaEnv):
         return observation, reward, bool(terminated), False, info
 
     def compute_reward(self, traj: Trajectory, task: ArrayLike, reward_type: str | None = None) -> FloatArray:
-        """Reward of every step of a trajectory under a task; see :meth:`TaskFamily.compute_reward`.
-
-        :param traj: the steps, arrays of shape (..., T, dim).
-        :param task: the task, shape (..., task_dim).
-        :param reward_type: ``"sparse"``, ``"dense"``, or None for the env's own.
-        :return: rewards, shape (..., T), float32.
-        :raises ValueError: if the reward type is unknown.
-        """
+        """:meth:`TaskFamily.compute_reward`, by default of the env's own reward type."""
         return self.task_family.compute_reward(traj, task, self.reward_type if reward_type is None else reward_type)
 
     def hindsight_task(self, traj: Trajectory, index: ArrayLike) -> FloatArray:
-        """The task that the next state of step ``index`` solves; see :meth:`TaskFamily.hindsight_task`.
-
-        :param traj: the steps, arrays of shape (..., T, dim).
-        :param index: which step, an int or an int array that broadcasts with the leading axes of ``traj``.
-        :return: tasks, shape (..., task_dim), float32.
-        """
+        """:meth:`TaskFamily.hindsight_task`."""
         return self.task_family.hindsight_task(traj, index)

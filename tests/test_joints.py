@@ -335,7 +335,7 @@ from sb3_htr.zoo.run.method import register_method
 
 register_method(
     "half-half",
-    label="Relabelled every other time, acted with at random",
+    about="PEARL that relabels every other time",
     relabeller="EpisodeClustering",
     relabel_probability=0.5,
     rl_reward_type="dense",

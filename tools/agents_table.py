@@ -47,7 +47,7 @@ def measure(path: Path) -> dict[str, Any]:
     agent = agent_at(path)
     model = agent.load()
     scores = {}
-    for explorer in dict.fromkeys((model.explorer.name, "prior")):
+    for explorer in dict.fromkeys((model.explorer.name, *agent.algorithm.also_explores_by)):
         returns, successes, _ = record_adaptation(model, agent.make_vec_env(100), None, N_EPISODES, explorer)
         first = np.where(successes.any(axis=1), successes.argmax(axis=1) + 1, N_EPISODES + 1)
         scores[explorer] = [float(returns[:, -1].mean()), float(successes[:, -1].mean()), float(first.mean())]

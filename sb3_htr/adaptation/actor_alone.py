@@ -5,13 +5,12 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
-from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.sac.policies import Actor
 from torch import nn
 
-from sb3_htr.common.linear import with_fast_linear
+from sb3_htr.common.latent_policy import LatentPolicy
+from sb3_htr.common.linear import with_fast_layers
 from sb3_htr.common.normalizer import ObservationNormalizer
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {
@@ -19,7 +18,7 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {
 }
 
 
-class ActorAlone(BasePolicy):
+class ActorAlone(LatentPolicy):
     """
     Actor and normalization of observations, without critics and encoder.
 
@@ -42,36 +41,16 @@ class ActorAlone(BasePolicy):
     ) -> None:
         super().__init__(observation_space, action_space, squash_output=True)
         self.activation_fn = activation_fn
+        self.latent_dim = latent_dim
         (obs_dim,) = observation_space.shape
         of_actor = spaces.Box(-np.inf, np.inf, (obs_dim + latent_dim,), np.float32)
         extractor = FlattenExtractor(of_actor)
         self.actor = Actor(of_actor, action_space, net_arch, extractor, extractor.features_dim, activation_fn)
-        with_fast_linear(self.actor)
+        with_fast_layers(self.actor)
         self.normalizer = ObservationNormalizer(obs_dim) if normalized else None
 
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """
-        :param observation: (obs_dim,) or (n, obs_dim)
-        :param state: tuple of one array, z of each observation (n, latent_dim)
-        :param episode_start: ignored
-        :param deterministic: mean action instead of a sample
-        :return: actions, and the state unchanged
-        """
-        assert state is not None
-        self._z = th.as_tensor(state[0], dtype=th.float32, device=self.device)
-        return super().predict(observation, None, episode_start, deterministic)[0], state
-
-    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        assert isinstance(observation, th.Tensor)
-        obs = observation.flatten(1).float()
-        obs = obs if self.normalizer is None else self.normalizer(obs)
-        actions: th.Tensor = self.actor(th.cat([obs, self._z.expand(len(obs), -1)], dim=1), deterministic)
+    def _act(self, obs_z: th.Tensor, deterministic: bool) -> th.Tensor:
+        actions: th.Tensor = self.actor(obs_z, deterministic)
         return actions
 
 

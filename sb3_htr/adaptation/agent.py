@@ -1,7 +1,6 @@
 """What :meth:`sb3_htr.PEARL.adapt` returns."""
 
 import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,9 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_htr.adaptation.actor_alone import acting_state, make_actor_alone
 from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.latent_policy import Obs, State
 from sb3_htr.common.plain import load_plain
+from sb3_htr.common.saving import with_suffix
 
 FORMAT = 1
 
@@ -32,12 +33,8 @@ class AdaptedAgent:
         self.successes = successes
 
     def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        self, observation: Obs, state: State = None, episode_start: np.ndarray | None = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, State]:
         """
         :param observation: (obs_dim,) or (n, obs_dim)
         :param state: ignored, the agent has no memory
@@ -57,7 +54,7 @@ class AdaptedAgent:
         :raises ValueError: for an actor of one's own
         """
         arrays = {name: th.from_numpy(np.array(getattr(self, name))) for name in ("z", "returns", "successes")}
-        with atomic_path(_with_suffix(path)) as temporary:
+        with atomic_path(with_suffix(path, ".pt")) as temporary:
             th.save({"format": FORMAT, "policy": acting_state(self.policy), **arrays}, temporary)
 
     @classmethod
@@ -69,7 +66,7 @@ class AdaptedAgent:
         :raises FileNotFoundError: if there is no such file
         :raises ValueError: if it is another kind of file
         """
-        path = _with_suffix(path)
+        path = with_suffix(path, ".pt")
         try:
             state: dict[str, Any] = load_plain(path)
             if state["format"] != FORMAT:
@@ -82,8 +79,3 @@ class AdaptedAgent:
         except Exception:  # whatever a stranger can put into a file
             raise ValueError(f"{path} is damaged, or no agent saved by AdaptedAgent.save: nothing of it was loaded.") from None
         return cls(policy.to(device), z, returns, successes)
-
-
-def _with_suffix(path: str | os.PathLike[str]) -> Path:
-    path = Path(path)
-    return path if path.suffix else path.with_suffix(".pt")

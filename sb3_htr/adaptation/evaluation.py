@@ -11,7 +11,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.loop import Adapts, Watched, adaptation_steps
-from sb3_htr.common.checks import check_is_no_gymnasium_vector_env, check_is_not_normalized, get_task_family
+from sb3_htr.common.checks import check_is_no_gymnasium_vector_env, check_is_not_normalized, check_numbers, get_task_family
 from sb3_htr.common.vec_env import make_task_vec_env
 
 
@@ -70,7 +70,9 @@ def run_adaptation(
     :param n_episodes: episodes per env
     :param deterministic: mean actions instead of samples
     :return: one row per env
+    :raises ValueError: if there are no episodes
     """
+    check_numbers(n_episodes=(n_episodes, 1, float("inf")))
     n_envs = env.num_envs
     episode, envs = np.zeros(n_envs, dtype=np.int64), np.arange(n_envs)
     returns = np.zeros((n_envs, n_episodes + 1))
@@ -113,8 +115,6 @@ def record_adaptation(
     """
     As :func:`evaluate_adaptation`, with what each step achieved.
     """
-    if n_episodes < 1:
-        raise ValueError(f"n_episodes is {n_episodes}, expected at least 1.")
     check_is_no_gymnasium_vector_env(env)
     n_tasks = 20 if tasks is None else len(tasks)
     if isinstance(env, str):

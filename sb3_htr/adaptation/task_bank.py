@@ -110,7 +110,7 @@ class TaskBank:
                 chosen.append(i)
         n_free = MAX_HINDSIGHT_TASKS - (len(self.tasks) - self.n_train)
         self._append(candidates[chosen[:n_free]])
-        for i in chosen[max(n_free, 0) : max(n_free, 0) + MAX_HINDSIGHT_TASKS]:
+        for i in chosen[n_free : n_free + MAX_HINDSIGHT_TASKS]:
             at = self.n_train + self._rng.integers(MAX_HINDSIGHT_TASKS)
             self.tasks[at], self.best_return[at], self.length[at] = candidates[i], 0, 0
 

@@ -218,8 +218,8 @@ def check_is_not_normalized(env: VecEnv) -> None:
     """
     if unwrap_vec_normalize(env) is not None:
         raise ValueError(
-            "VecNormalize stands between the env and relabelled rewards, and is not saved with the model: leave it away and "
-            "pass policy_kwargs={'normalize_observations': True}. Rewards cannot be normalized: all tasks share one scale."
+            "VecNormalize stands between the env and relabelled rewards, and is not saved with the model: leave it away, the "
+            "policy normalizes observations itself. Rewards cannot be normalized: all tasks share one scale."
         )
 
 

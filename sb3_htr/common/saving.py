@@ -3,20 +3,20 @@
 import io
 import pathlib
 from collections.abc import Iterable
-from typing import cast
+from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_htr.common.atomic import atomic_path
 
 
-def with_suffix(path: str | pathlib.Path | io.BufferedIOBase, suffix: str) -> pathlib.Path:
+def with_suffix(path: Any, suffix: str) -> pathlib.Path:
     """
-    :param path: of a file
+    :param path: of a file, a string or an ``os.PathLike``
     :param suffix: of such files
     :return: the path, with the suffix if it had none
     """
-    path = pathlib.Path(cast(str, path))
+    path = pathlib.Path(path)
     return path if path.suffix else path.with_suffix(suffix)
 
 

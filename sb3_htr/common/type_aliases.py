@@ -68,14 +68,12 @@ class RewardLabels(NamedTuple):
     What n of the transitions of a meta-batch would return under each of its M tasks: what a model of rewards learns from.
 
     :param rows: (n,) int64, which transitions of the RL batch
-    :param success: (n, M) float32, 1 where the transition solves the task
-    :param reward: (n, M) float32, its reward beside the task-free one
+    :param reward: (n, M) float32, its reward beside the task-free one, above 0 where the transition solves the task
     :param task_free: (n,) float32, the task-free one
     :param inferred: (M,) float32, 1 for tasks with a reward in their context, from which they can be inferred
     """
 
     rows: th.Tensor
-    success: th.Tensor
     reward: th.Tensor
     task_free: th.Tensor
     inferred: th.Tensor

@@ -78,14 +78,11 @@ class BatchedTaskVecEnv(VecEnv):
         self.vector_env.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        chosen = list(self._get_indices(indices))
-        if attr_name in PER_ENV:
-            values = getattr(self.vector_env, PER_ENV[attr_name])
-            return [values[i] for i in chosen]
-        return [getattr(self.vector_env, attr_name)] * len(chosen)
+        value = getattr(self.vector_env, PER_ENV.get(attr_name, attr_name))
+        return [value[i] if attr_name in PER_ENV else value for i in self._get_indices(indices)]
 
     def has_attr(self, attr_name: str) -> bool:
-        return hasattr(self.vector_env, attr_name)
+        return hasattr(self.vector_env, PER_ENV.get(attr_name, attr_name))
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         setattr(self.vector_env, attr_name, value)

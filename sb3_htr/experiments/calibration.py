@@ -39,15 +39,15 @@ def calibration(model: Model, env_id: str, env_kwargs: KwArgs) -> np.ndarray:
     steps = list(adaptation_steps(env, adaptation, N_EPISODES, policy.unscale_action, adaptation.act))
     # (n_tasks, n_steps, ...) each
     obs, actions, rewards, next_obs, dones = (np.stack(column, axis=1) for column in list(zip(*steps, strict=True))[:5])
-    unscaled, task_free = policy.unscale_action(actions), np.zeros_like(rewards, dtype=np.float32)
-    traj = Trajectory(*(values[:, None] for values in (obs, unscaled, next_obs, task_free)))
+    traj = Trajectory(obs, policy.unscale_action(actions), next_obs, np.zeros_like(rewards, dtype=np.float32))
+    # Without what is task-free: where a reward of 0 is that of a success, -1 is the other one
+    gains = family.compute_reward(traj, tasks) * family.is_success(traj, tasks)
     # (n_tasks, n_tasks, n_steps): where the first was adapted to, is the second solved?
-    success = family.is_success(traj, tasks)
+    success = family.is_success(Trajectory(*(values[:, None] for values in traj)), tasks)
     solved, means = [], []
     for task in range(len(tasks)):
         episodes = np.split(np.arange(dones.shape[1]), np.flatnonzero(dones[task]) + 1)
-        gain = rewards[task] * success[task, task]
-        best = max(episodes, key=lambda episode: gain[episode].sum())
+        best = max(episodes, key=lambda episode: gains[task, episode].sum())
         if success[task, task, best].any():
             taken, lengths = evenly_spread(np.array([len(best)]), model.context_size)
             o, a, r = (th.as_tensor(x[task, best[taken]], dtype=th.float32) for x in (obs, actions, rewards))

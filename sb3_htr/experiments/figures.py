@@ -38,7 +38,8 @@ def n_seeds(results: Results) -> int:
 
 def learning(results: Results, path: Path) -> None:
     """
-    Left: learning curves on validation tasks. Right: the final models' adaptation to the test tasks.
+    Left: learning curves on validation tasks. Right: the final models' adaptation to the test tasks, by the first explorer of
+    each and by the prior.
 
     :param results: raw results of the cells
     :param path: picture to write
@@ -48,11 +49,11 @@ def learning(results: Results, path: Path) -> None:
     for (colour, _), (variant, runs) in zip(curve_styles([*groups]), groups.items(), strict=True):
         curve = np.stack([raw["curve"].mean(axis=1) for _, raw in runs])
         band(left, runs[0][1]["timesteps"] / 1000, curve, colour, "-", variant)
-        for explorer, style in zip(("belief", "prior"), ("-", "--"), strict=True):
-            if f"returns_{explorer}" not in runs[0][1]:
-                continue
+        explorers = [evaluation.explorer for evaluation in runs[0][0].evaluations if not evaluation.tested_on]
+        styles = {"prior": "--", **dict.fromkeys(explorers[:1], "-")}
+        for explorer in [explorer for explorer in explorers if explorer in styles]:
             returns = np.stack([raw[f"returns_{explorer}"] for _, raw in runs])
-            band(right, np.arange(1, returns.shape[-1] + 1), returns, colour, style, f"{variant}, explorer {explorer}")
+            band(right, np.arange(1, returns.shape[-1] + 1), returns, colour, styles[explorer], f"{variant}, {explorer}")
     left.set_xlabel("thousand env steps of meta-training")
     left.set_ylabel("return of the last adaptation episode")
     left.set_title("validation tasks, during meta-training", fontsize=10)
@@ -90,7 +91,6 @@ def goal_distance(results: Results, path: Path) -> None:
     groups = by_variant(results)
     for (colour, _), (variant, runs) in zip(curve_styles([*groups]), groups.items(), strict=True):
         x = sorted({cell.env_kwargs["goal_distance"] for cell, _ in runs})
-
         ordered = sorted(runs, key=lambda run: (run[0].env_kwargs["goal_distance"], run[0].seed))
         optimum = [optimal_return(**cell.env_kwargs) for cell, _ in ordered]
         for axes, metric in ((left, "last_episode_return"), (right, "success_rate")):

@@ -107,8 +107,8 @@ POINT, SPEED, WHEELED, ANT = "SparsePointRobot-v0", "SparseTargetSpeed-v0", "Spa
 
 # The Point Robot's goals: as in training, nearer, and further away
 DISTANCES: tuple[KwArgs, ...] = ({}, {"goal_distance": 0.8}, {"goal_distance": 1.2}, {"goal_distance": 1.4})
-# Those of the robots that take long to simulate, further away
-FURTHER = by(("belief", "aggregate"), {"goal_distance": 2.5})
+# Robots take long to simulate: the default and PEARL's own protocol; and the default further away
+OF_ROBOTS = (*by(("belief", "prior")), *by(BELIEF, {"goal_distance": 2.5}))
 
 
 def replay(**settings: Any) -> dict[str, Any]:
@@ -153,7 +153,7 @@ ALL = (
         600_000,
         tuple(map(Variant, ("htr-ser", "pearl-dense", "pearl-sparse"))),
         eval_freq=50_000,
-        evaluations=(*by(EXPLORERS), *FURTHER),
+        evaluations=OF_ROBOTS,
     ),
     Experiment(
         "ant",
@@ -162,7 +162,7 @@ ALL = (
         600_000,
         tuple(map(Variant, ("htr-ser", "pearl-dense", "pearl-sparse"))),
         eval_freq=100_000,
-        evaluations=(*by(EXPLORERS), *FURTHER),
+        evaluations=OF_ROBOTS,
     ),
     Experiment(
         "target_speed",

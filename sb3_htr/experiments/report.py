@@ -2,20 +2,57 @@
 
 import json
 import platform
+from collections.abc import Iterator
 from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.experiments import figures
 from sb3_htr.experiments.calibration import expected_calibration_error
-from sb3_htr.experiments.cell import Cell
+from sb3_htr.experiments.cell import Cell, Evaluation
 from sb3_htr.experiments.grid import Experiment
 from sb3_htr.experiments.protocol import EVAL_SEEDS, METRICS, scores
 from sb3_htr.experiments.runner import LOGGED
 from sb3_htr.zoo.plots.intervals import iqm_difference, iqm_interval
+
+RETURN = "last_episode_return"
+
+
+class Runs(NamedTuple):
+    """
+    Of one variant, in one env.
+
+    :param cells: one for each seed
+    :param raws: their raw results
+    """
+
+    cells: list[Cell]
+    raws: list[Any]
+
+    @property
+    def evaluations(self) -> tuple[Evaluation, ...]:
+        """Of each of them."""
+        return self.cells[0].evaluations
+
+    def returns(self, evaluation: Evaluation) -> np.ndarray:
+        """(n_runs, n_eval_seeds, n_tasks), of the last adaptation episode."""
+        return scores(self.raws, RETURN, evaluation.name)
+
+    def about(self, evaluation: Evaluation) -> dict[str, Any]:
+        """What a number is of."""
+        first = self.cells[0]
+        what = {"env": first.env_id, "env_kwargs": first.env_kwargs, "method": first.method, "variant": first.variant}
+        settings = {"settings": first.settings, "env_steps": first.n_timesteps, "n_seeds": len(self.cells)}
+        return {**what, **settings, **evaluation._asdict()}
+
+    def means(self) -> dict[str, float | None]:
+        """Over all runs; None where an algorithm does not tell."""
+        means = {key: float(np.mean([raw[key] for raw in self.raws])) for key in (*LOGGED, "wall_s")}
+        means["calibration_error"] = expected_calibration_error(np.sum([raw["calibration"] for raw in self.raws], axis=0))
+        return {key: None if np.isnan(mean) else round(mean, 4) for key, mean in means.items()}
 
 
 def summarize(command: str, results: dict[Cell, Path]) -> dict[str, Any]:
@@ -24,60 +61,50 @@ def summarize(command: str, results: dict[Cell, Path]) -> dict[str, Any]:
     :param results: raw results of the cells of an experiment
     :return: content of ``summary.json``
     """
-    groups: dict[str, dict[str, list[Cell]]] = {}
-    for cell in results:
-        groups.setdefault(str(cell.env_kwargs), {}).setdefault(cell.variant, []).append(cell)
-    rows, differences, explorer_differences = [], [], []
-    for variants in groups.values():
-        references: dict[str, np.ndarray] = {}
-        first_references: dict[str, np.ndarray] = {}
-        compared = next(iter(variants))
-        for variant, cells in variants.items():
-            first, raws = cells[0], [np.load(results[cell]) for cell in cells]
-            about: dict[str, Any] = {
-                "env": first.env_id,
-                "env_kwargs": first.env_kwargs,
-                "method": first.method,
-                "variant": variant,
-            }
-            about |= {"settings": first.settings, "env_steps": first.n_timesteps, "n_seeds": len(cells)}
-            means = {key: round(float(np.mean([raw[key] for raw in raws])), 4) for key in (*LOGGED, "wall_s")}
-            calibration_error = expected_calibration_error(np.sum([raw["calibration"] for raw in raws], axis=0))
-            means["calibration_error"] = round(calibration_error, 4)
-            first_explorers: dict[str, tuple[str, np.ndarray]] = {}
-            for evaluation in first.evaluations:
-                tested = {**about, **evaluation._asdict()}
-                for metric in METRICS:
-                    interval = _rounded(iqm_interval(scores(raws, metric, evaluation.name)))
-                    rows.append({**tested, "metric": metric, **interval, **means})
-                returns = scores(raws, "last_episode_return", evaluation.name)
-                place = str(evaluation.tested_on)
-                if variant == compared:
-                    references[evaluation.name] = returns
-                    first_references.setdefault(place, returns)
-                # What explores in a way of its own is compared with the first explorer
-                reference = references.get(evaluation.name, first_references[place])
-                explorer, by_it = first_explorers.setdefault(place, (evaluation.explorer, returns))
-                if explorer != evaluation.explorer:
-                    difference = {**tested, "of": explorer, "metric": "last_episode_return"}
-                    explorer_differences.append({**difference, **_rounded(iqm_interval(by_it - returns))})
-                if variant != compared:
-                    difference = {**tested, "of": compared, "metric": "last_episode_return"}
-                    differences.append({**difference, **_rounded(iqm_difference(reference, returns))})
-    commits = sorted({str(np.load(path)["commit"]) for path in results.values()})
+    groups: dict[str, dict[str, Runs]] = {}
+    for cell, path in results.items():
+        runs = groups.setdefault(str(cell.env_kwargs), {}).setdefault(cell.variant, Runs([], []))
+        runs.cells.append(cell)
+        runs.raws.append(np.load(path))
+    compared = [[*variants.values()] for variants in groups.values()]
+    all_runs = [runs for group in compared for runs in group]
     return {
         "name": next(iter(results)).experiment,
         "command": command,
-        "commit": ", ".join(commits),
+        "commit": ", ".join(sorted({str(raw["commit"]) for runs in all_runs for raw in runs.raws})),
         "date": date.today().isoformat(),
         "machine": f"{_processor()}, one thread per run, Python {platform.python_version()}",
         "n_eval_seeds": len(EVAL_SEEDS),
-        "rows": rows,
-        # first variant minus this one, by the same explorer on the same tasks
-        "differences": differences,
-        # first explorer minus this one, of the same models
-        "explorer_differences": explorer_differences,
+        "rows": [row for runs in all_runs for row in _rows(runs)],
+        "differences": [row for first, *others in compared for other in others for row in _differences(first, other)],
+        "explorer_differences": [row for runs in all_runs for row in _explorer_differences(runs)],
     }
+
+
+def _rows(runs: Runs) -> Iterator[dict[str, Any]]:
+    means = runs.means()
+    for evaluation in runs.evaluations:
+        for metric in METRICS:
+            interval = _rounded(iqm_interval(scores(runs.raws, metric, evaluation.name)))
+            yield {**runs.about(evaluation), "metric": metric, **interval, **means}
+
+
+def _differences(first: Runs, other: Runs) -> Iterator[dict[str, Any]]:
+    """First variant minus the other, by the same explorer on the same tasks; by its first one, if it has not the same."""
+    for evaluation in other.evaluations:
+        there = [own for own in first.evaluations if own.tested_on == evaluation.tested_on]
+        own = evaluation if evaluation in there else there[0]
+        interval = _rounded(iqm_difference(first.returns(own), other.returns(evaluation)))
+        yield {**other.about(evaluation), "of": first.cells[0].variant, "metric": RETURN, **interval}
+
+
+def _explorer_differences(runs: Runs) -> Iterator[dict[str, Any]]:
+    """First explorer minus each other one, of the same models."""
+    for evaluation in runs.evaluations:
+        first = next(other for other in runs.evaluations if other.tested_on == evaluation.tested_on)
+        if evaluation != first:
+            interval = _rounded(iqm_interval(runs.returns(first) - runs.returns(evaluation)))
+            yield {**runs.about(evaluation), "of": first.explorer, "metric": RETURN, **interval}
 
 
 def _rounded(interval: tuple[float, float, float]) -> dict[str, float]:

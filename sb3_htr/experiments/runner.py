@@ -3,6 +3,7 @@
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -103,12 +104,24 @@ def find_finished(cell: Cell, folder: Path) -> tuple[Path, Model] | None:
                     f"{run} has {key} {record[key]!r}, but {cell.experiment}/{cell.name} needs {getattr(cell, key)!r}: "
                     f"move this run away, or choose other --runs."
                 )
+        has, needs = (_params(arguments) for arguments in (record["arguments"], cell.training(folder)))
+        if has != needs:
+            raise ValueError(
+                f"{run} has the settings {sorted(has)}, but {cell.experiment}/{cell.name} needs {sorted(needs)}: move this "
+                "run away, or choose other --runs."
+            )
         # An interrupted training leaves a model, too
         if (run / f"{file_stem(cell.env_id)}.zip").exists():
             model = agent_at(run, "last").load()
             if model.num_timesteps >= cell.n_timesteps:
                 return run, model
     return None
+
+
+def _params(arguments: list[str]) -> set[str]:
+    """Hyperparameters among the arguments of a training."""
+    after = arguments[arguments.index("-params") + 1 :] if "-params" in arguments else []
+    return set(takewhile(lambda word: not word.startswith("-"), after))
 
 
 @contextmanager

@@ -402,9 +402,8 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         reward = task_reward(self.task_family.compute_reward(traj, tasks), traj.task_free_reward)
         rewarded = task_reward(context[:, columns.reward], context[:, columns.task_free_reward]) > 0
         inferred = np.logical_or.reduceat(rewarded, np.cumsum(n_context) - n_context)
-        labels = (chosen, reward.T > 0, reward.T, traj.task_free_reward, inferred)
-        dtypes = (np.int64, *[np.float32] * 4)
-        return RewardLabels(*(self.to_torch(x.astype(dtype)) for x, dtype in zip(labels, dtypes, strict=True)))
+        labels = (chosen, np.ascontiguousarray(reward.T, dtype=np.float32), traj.task_free_reward, inferred.astype(np.float32))
+        return RewardLabels(*(self.to_torch(x, copy=False) for x in labels))
 
     def take(self, virtual: np.ndarray, is_hindsight: np.ndarray, store: EpisodeStore) -> np.ndarray:
         """

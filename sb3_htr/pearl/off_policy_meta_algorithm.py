@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, TrainFreq
 from stable_baselines3.common.utils import check_for_correct_spaces
@@ -29,6 +29,8 @@ from sb3_htr.adaptation.loop import adaptation_steps
 from sb3_htr.adaptation.task_bank import TaskBank
 from sb3_htr.common import checks
 from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.callback import followed_by
+from sb3_htr.common.latent_policy import Obs, State
 from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.random_state import get_generator_state, set_generator_state
 from sb3_htr.common.saving import AtomicSave, with_suffix
@@ -254,11 +256,7 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
         )
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        shown = super()._init_callback(callback)
-        if progress_bar:
-            shown = CallbackList([shown, MetaProgressBarCallback()])
-            shown.init_callback(self)
-        return shown
+        return super()._init_callback(followed_by(callback, MetaProgressBarCallback()) if progress_bar else callback)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         assert self.replay_buffer is not None
@@ -308,6 +306,9 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
         if continue_training:
             # In each rollout: a sparse reward can go unseen for many, and the env may be another one than before
             replay_buffer.check_reward_hook(self.task_bank.new)
+            # Now and not step by step: what a posterior takes in during a rollout stays on one scale
+            columns = replay_buffer.transitions
+            self.policy.watch(np.concatenate([episode[:, columns.observation] for _, episode in self.task_bank.new]))
             self.task_bank.update()
             if replay_buffer.tells_rewards:
                 self.logger.record("rollout/train_tasks_reached", self.task_bank.n_train_solved)
@@ -354,7 +355,6 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
 
     def _explore(self, adaptation: Adaptation, learning_starts: int, obs: np.ndarray) -> np.ndarray:
         """Actions of a rollout, scaled to [-1, 1]."""
-        self.policy.watch(obs)
         if self.num_timesteps < learning_starts:
             return self._rng.uniform(-1, 1, (len(obs), *self.action_space.shape)).astype(np.float32)  # type: ignore[misc]
         return adaptation.act(obs, deterministic=False)
@@ -457,12 +457,8 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
         return AdaptedAgent(self.policy, adaptation.explorer.final_z()[0], returns, successes)
 
     def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        self, observation: Obs, state: State = None, episode_start: np.ndarray | None = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, State]:
         """
         :param observation: (obs_dim,) or (n, obs_dim)
         :param state: tuple of one array, z of each observation (n, latent_dim); without it the agent is not adapted to any
@@ -494,9 +490,9 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
         Save replay and what was learnt of it, as plain arrays.
 
         :param path: file, ``.pt`` is added to a name without suffix; it is replaced at the end or not at all
+        :raises ValueError: for a model that was loaded without an env
         """
-        assert self.replay_buffer is not None and self.task_bank is not None
-        state = {"replay": self.replay_buffer.state_dict(), "task_bank": self.task_bank.state_dict()}
+        state = self._replay_state()
         if isinstance(path, io.IOBase):
             return th.save(state, cast(IO[bytes], path))
         with atomic_path(with_suffix(path, ".pt")) as temporary:
@@ -508,10 +504,7 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
         :param truncate_last_traj: not used, only whole episodes are stored
         :raises ValueError: if it is no such file, or one of a model with other settings
         """
-        if self.replay_buffer is None or self.task_bank is None:
-            raise ValueError(
-                "This model has no env, so it has no replay buffer to fill: pass env=... to load, or call set_env."
-            )
+        own_replay, own_task_bank = self._replay()
         file: Any = path if isinstance(path, io.IOBase) else with_suffix(path, ".pt")
         try:
             # torch writes a zip file, and does not look at its checksums
@@ -527,10 +520,19 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
                 f"{path} is damaged, or no replay buffer of sb3_htr: pass a file that save_replay_buffer has written."
             ) from None
         try:
-            self.replay_buffer.load_state_dict(replay)
+            own_replay.load_state_dict(replay)
         except KeyError as missing:
             raise ValueError(f"{path} has no {missing}: make the model with the relabeller that it was saved with.") from None
-        self.task_bank.load_state_dict(task_bank)
+        own_task_bank.load_state_dict(task_bank)
+
+    def _replay(self) -> tuple[MultiTaskReplayBuffer, TaskBank]:
+        if self.replay_buffer is None or self.task_bank is None:
+            raise ValueError("This model has no env, so it has no replay buffer: pass env=... to load, or call set_env.")
+        return self.replay_buffer, self.task_bank
+
+    def _replay_state(self) -> dict[str, Any]:
+        replay, task_bank = self._replay()
+        return {"replay": replay.state_dict(), "task_bank": task_bank.state_dict()}
 
     def state_dict(self) -> dict[str, Any]:
         """
@@ -539,13 +541,11 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
 
         :return: tensors, numbers, strings, None, for :meth:`load_state_dict`
         """
-        assert self.replay_buffer is not None and self.task_bank is not None
-        state = get_training_state(self, COUNTERS)
+        replay_state, state = self._replay_state(), get_training_state(self, COUNTERS)
         return {
             **state,
+            **replay_state,
             "task_queue": th.from_numpy(self._task_queue.copy()),
-            "replay": self.replay_buffer.state_dict(),
-            "task_bank": self.task_bank.state_dict(),
             "random": {**state["random"], "model": get_generator_state(self._rng)},
         }
 
@@ -555,9 +555,9 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
 
         :param state: of :meth:`state_dict` of a model with the same settings
         """
-        assert self.replay_buffer is not None and self.task_bank is not None
+        replay, task_bank = self._replay()
         set_training_state(self, state)
         self._task_queue = state["task_queue"].numpy().copy()
-        self.replay_buffer.load_state_dict(state["replay"])
-        self.task_bank.load_state_dict(state["task_bank"])
+        replay.load_state_dict(state["replay"])
+        task_bank.load_state_dict(state["task_bank"])
         self._pending_random = state["random"]

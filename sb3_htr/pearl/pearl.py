@@ -231,13 +231,14 @@ class PEARL(OffPolicyMetaAlgorithm):
         for optimizer in learning:
             optimizer.step()
 
-        # The actor sees z, but does not shape it
+        # The actor sees z, but does not shape it; the critics judge, and do not learn
         obs_z = obs_z.detach()
         actions_pi, log_prob = self.policy.sample_actions(obs_z)
+        self.critic.requires_grad_(False)
         actor_loss = ((ent_coef * log_prob - self.critic(obs_z, actions_pi).amin(dim=0)) * weight).sum()
+        self.critic.requires_grad_(True)
         self.actor.optimizer.zero_grad()
-        # The critics' weights get no gradient, and none is computed
-        actor_loss.backward(inputs=list(self.actor.parameters()))
+        actor_loss.backward()
         self.actor.optimizer.step()
 
         if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:

@@ -9,12 +9,13 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, SACPolicy
 from torch import nn
 
 from sb3_htr.adaptation.context import context_dim, context_rows
-from sb3_htr.common.linear import Linear, with_fast_linear
+from sb3_htr.common.latent_policy import LatentPolicy
+from sb3_htr.common.linear import Linear, Stack, with_fast_layers
 from sb3_htr.common.normalizer import ObservationNormalizer
 from sb3_htr.common.type_aliases import Context
 from sb3_htr.pearl.encoder import ContextEncoder
@@ -46,9 +47,9 @@ class LatentCritic(BaseModel):
         self.n_critics = n_critics
         units = [observation_space.shape[0] + action_space.shape[0], *net_arch]
 
-        def network() -> nn.Sequential:
+        def network() -> Stack:
             hidden = [(Linear(i, o), nn.LayerNorm(o), activation_fn()) for i, o in pairwise(units)]
-            return nn.Sequential(*(module for layer in hidden for module in layer), Linear(units[-1], 1))
+            return Stack(*(module for layer in hidden for module in layer), Linear(units[-1], 1))
 
         self.networks = nn.ModuleList(network() for _ in range(n_critics))
 
@@ -59,10 +60,10 @@ class LatentCritic(BaseModel):
         :return: (n_critics, n)
         """
         x = th.cat([obs, actions], dim=1)
-        return th.cat([network(x) for network in self.networks], dim=1).T
+        return th.cat([network(x).T for network in self.networks])
 
 
-class PEARLPolicy(SACPolicy):
+class PEARLPolicy(LatentPolicy, SACPolicy):
     """
     Actor, critics and context encoder of PEARL, and a model of rewards.
 
@@ -147,7 +148,7 @@ class PEARLPolicy(SACPolicy):
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         actor = super().make_actor(features_extractor)
-        with_fast_linear(actor)
+        with_fast_layers(actor)
         return actor
 
     def make_critic(self, features_extractor: nn.Module | None = None) -> LatentCritic:  # type: ignore[override]
@@ -173,30 +174,6 @@ class PEARLPolicy(SACPolicy):
             **{key: data[key] for key in keys},
         )
 
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """
-        :param observation: (obs_dim,) or (n, obs_dim)
-        :param state: tuple of one array, z of each observation (n, latent_dim); None is the prior mean
-        :param episode_start: ignored: z lives longer than an episode
-        :param deterministic: mean action instead of a sample
-        :return: actions, and the state unchanged
-        """
-        z = np.zeros((1, self.latent_dim), dtype=np.float32) if state is None else state[0]
-        self._z = th.as_tensor(z, dtype=th.float32, device=self.device)
-        actions, _ = super().predict(observation, None, episode_start, deterministic)
-        return actions, (z,)
-
-    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        assert isinstance(observation, th.Tensor)
-        obs = self.normalize(observation.flatten(1).float())
-        return self._act(th.cat([obs, self._z.expand(len(obs), -1)], dim=1), deterministic)
-
     def act(self, obs: np.ndarray, z: np.ndarray, deterministic: bool = False) -> np.ndarray:
         """
         What :meth:`predict` does, without its checks and conversions, which take longer: for every step of an adaptation.
@@ -210,13 +187,6 @@ class PEARLPolicy(SACPolicy):
             normal = self.normalize(th.as_tensor(obs, dtype=th.float32, device=self.device))
             obs_z = th.cat([normal, th.as_tensor(z, device=self.device)], dim=1)
             return np.asarray(self._act(obs_z, deterministic).cpu().numpy())
-
-    def normalize(self, obs: th.Tensor) -> th.Tensor:
-        """
-        :param obs: (n, obs_dim), as the env gave them
-        :return: the same shape, as all networks see them
-        """
-        return obs if self.normalizer is None else self.normalizer(obs)
 
     def watch(self, obs: np.ndarray) -> None:
         """

@@ -1,18 +1,19 @@
 """What the rivals share: they train on the envs of PEARL, are evaluated as PEARL is, and go on from the same checkpoints."""
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.adaptation import Step
 from sb3_htr.adaptation.loop import Watched
+from sb3_htr.common.callback import followed_by
 from sb3_htr.common.saving import AtomicSave
 from sb3_htr.common.training_state import get_training_state, set_random_state, set_training_state
 
@@ -25,9 +26,9 @@ class OwnWay:
     name = "own"
 
 
-class RivalAdaptation:
+class RivalAdaptation(ABC):
     """
-    Keeps what anybody can see of an adaptation; a subclass adds ``act``.
+    Keeps what anybody can see of an adaptation; a subclass says how to act.
 
     :param n_envs: number of tasks
     """
@@ -35,6 +36,14 @@ class RivalAdaptation:
     def __init__(self, n_envs: int) -> None:
         self.n_envs = n_envs
         self._found = np.zeros(n_envs, dtype=bool)
+
+    @abstractmethod
+    def act(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
+        """
+        :param obs: (n_envs, obs_dim)
+        :param deterministic: mean actions instead of samples
+        :return: (n_envs, action_dim), scaled to [-1, 1]
+        """
 
     def observe(self, step: Step) -> None:
         """
@@ -75,11 +84,6 @@ class ToldAdaptation(RivalAdaptation):
         self._tasks = tasks
 
     def act(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
-        """
-        :param obs: (n_envs, obs_dim)
-        :param deterministic: mean actions instead of samples
-        :return: (n_envs, action_dim), scaled to [-1, 1]
-        """
         return self._act(obs, self._tasks, deterministic)
 
 
@@ -136,14 +140,13 @@ class Rival(AtomicSave, BaseAlgorithm):
         self._last_episode_starts = np.ones(self.env.num_envs, dtype=bool)
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        with_start = CallbackList([super()._init_callback(callback, progress_bar), FreshStart()])
-        with_start.init_callback(self)
-        return with_start
+        return super()._init_callback(followed_by(callback, FreshStart()), progress_bar)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        if self.env is None:
+            raise ValueError("The model was loaded without an env, which learning needs: pass env to load, or call set_env.")
         result = super()._setup_learn(*args, **kwargs)
         if self._pending_random is not None:
-            assert self.env is not None
             set_random_state(self.env, self._pending_random)
             self._pending_random = None
         return result

@@ -44,11 +44,6 @@ class TrialAdaptation(RivalAdaptation):
         self._kept_memory, self._kept_last = self._memory.copy(), self._last.columns.copy()
 
     def act(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
-        """
-        :param obs: (n_envs, obs_dim)
-        :param deterministic: mean actions instead of samples
-        :return: (n_envs, action_dim), scaled to [-1, 1]
-        """
         begins = np.zeros(self.n_envs, dtype=bool)
         actions, memory = self.policy.predict(
             self._last.beside(obs), (self._memory[0], self._memory[1]), begins, deterministic
@@ -58,9 +53,6 @@ class TrialAdaptation(RivalAdaptation):
         return self.policy.scale_action(actions)
 
     def observe(self, step: Step) -> None:
-        """
-        :param step: what each env did
-        """
         super().observe(step)
         self._last.take_in(step.actions, step.rewards, step.dones)
         ended = np.flatnonzero(step.dones)
@@ -137,15 +129,23 @@ class RL2(Rival, RecurrentPPO):
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """
-        :param env: env of the same spaces and number of copies
+        :param env: env of the same spaces, number of copies and time limit
         :param force_reset: reset before training goes on
+        :raises ValueError: for another time limit
         """
         super().set_env(env, force_reset)
         self._set_trials()
 
     def _set_trials(self) -> None:
-        if self.env is not None:
-            self.env.n_episodes = self.n_episodes_per_trial
+        if self.env is None:
+            return
+        self.env.n_episodes = self.n_episodes_per_trial
+        n_steps = self.n_trials_per_rollout * self.env.max_trial_steps
+        if n_steps != self.n_steps:
+            raise ValueError(
+                f"Whole trials in this env are rollouts of {n_steps} steps, but those of the model have {self.n_steps}: give "
+                "an env of the same time limit, or make a new model."
+            )
 
     def dump_logs(self, iteration: int = 0) -> None:
         """

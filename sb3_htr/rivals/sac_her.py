@@ -1,5 +1,6 @@
 """SAC with hindsight experience replay, told its task: the ceiling for agents that have to find it out."""
 
+import warnings
 from typing import Any, ClassVar
 
 import numpy as np
@@ -7,14 +8,21 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.type_aliases import DictReplayBufferSamples, GymEnv, RolloutReturn
+from stable_baselines3.common.type_aliases import DictReplayBufferSamples, GymEnv, RolloutReturn, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 from stable_baselines3.sac import SAC
 from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_htr.adaptation.loop import Watched
-from sb3_htr.common.checks import check_is_no_gymnasium_vector_env, check_numbers, get_max_episode_steps
+from sb3_htr.common.checks import (
+    check_is_no_gymnasium_vector_env,
+    check_numbers,
+    check_same_family,
+    family_facts,
+    get_max_episode_steps,
+    get_task_family,
+)
 from sb3_htr.common.type_aliases import Trajectory
 from sb3_htr.common.vec_env import in_float32, make_task_vec_env
 from sb3_htr.rivals.base import Rival, ToldAdaptation
@@ -66,6 +74,12 @@ class TaskHerReplayBuffer(HerReplayBuffer):
         self._current_ep_start = state["begun"].cpu().numpy().copy()
         self.pos, self.full = state["pos"], state["full"]
 
+    def truncate_last_trajectory(self) -> None:
+        """End the episodes that are not complete, because all envs are about to be reset."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # SB3 takes it for a mistake
+            super().truncate_last_trajectory()
+
     def _arrays(self) -> dict[str, np.ndarray]:
         plain = ("actions", "rewards", "dones", "timeouts", "ep_start", "ep_length")
         return {
@@ -113,16 +127,10 @@ class SACHER(Rival, SAC):
                 raise ValueError(f"SACHER has no setting {name!r}: a rollout is an episode of each env, and replay is HER's.")
         if isinstance(env, str):
             env = make_task_vec_env(env, N_ENVS, seed)
-        n_steps = 1
-        if env is not None:
-            env = self._wrap_env(env)
-            n_steps = get_max_episode_steps(env)
         super().__init__(
             policy=policy,
             env=env,  # type: ignore[arg-type]
-            train_freq=(n_steps, "step"),
             gradient_steps=gradient_steps,
-            replay_buffer_class=TaskHerReplayBuffer,
             replay_buffer_kwargs=replay_buffer_kwargs,
             seed=seed,
             **kwargs,
@@ -142,39 +150,54 @@ class SACHER(Rival, SAC):
             super()._setup_model()
             self.replay_buffer = None
         else:
+            self._setup_replay(self.env)
             super()._setup_model()
-            assert isinstance(self.env, ShownTaskVecEnv)
-            self.shown = self.env.shown
+
+    def _setup_replay(self, env: VecEnv) -> None:
+        assert isinstance(env, ShownTaskVecEnv)
+        self.shown = env.shown
+        self.train_freq = TrainFreq(get_max_episode_steps(env), TrainFrequencyUnit.STEP)  # type: ignore[assignment]
+        if self._has_experience():
+            assert isinstance(self.replay_buffer, TaskHerReplayBuffer)
+            self.replay_buffer.env = env
+            return
+        of_env: Any = self.observation_space, self.action_space, env, self.device, self.n_envs
+        self.replay_buffer = TaskHerReplayBuffer(self.buffer_size, *of_env, **self.replay_buffer_kwargs)
+
+    def _has_experience(self) -> bool:
+        return self.replay_buffer is not None and self.replay_buffer.size() > 0
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        :param env: env of the same spaces and number of copies; its task family replaces the old one if nothing was collected
+        :param force_reset: reset before training goes on
+        :raises ValueError: if there is experience of another task family
+        """
+        vec_env = self._wrap_env(env)
+        if self._has_experience():
+            check_same_family(family_facts(self.shown.family), family_facts(get_task_family(vec_env)), "The env")
+        super().set_env(vec_env, force_reset)
+        self._setup_replay(vec_env)
 
     def begin_rollout(self) -> None:
-        """Begin new episodes in all envs."""
         super().begin_rollout()
-        buffer = self.replay_buffer
-        assert isinstance(buffer, TaskHerReplayBuffer)
-        if (buffer._current_ep_start != buffer.pos).any():
-            buffer.truncate_last_trajectory()
+        assert isinstance(self.replay_buffer, TaskHerReplayBuffer)
+        self.replay_buffer.truncate_last_trajectory()
 
     def collect_rollouts(self, env: VecEnv, callback: BaseCallback, *args: Any, **kwargs: Any) -> RolloutReturn:
-        """As SAC's, logged rollout by rollout instead of episode by episode."""
+        """As SAC's, but ``log_interval`` counts rollouts instead of episodes."""
         log_interval = kwargs.pop("log_interval", None)
         rollout = super().collect_rollouts(env, callback, *args, **kwargs)
-        if log_interval is not None and rollout.continue_training:
+        n_rollouts = self.num_timesteps // (self.n_envs * self.train_freq.frequency)  # type: ignore[union-attr]
+        if log_interval is not None and rollout.continue_training and n_rollouts % log_interval == 0:
             self.dump_logs()
         return rollout
 
     def state_dict(self) -> dict[str, Any]:
-        """
-        :return: everything that a training in progress is, between two rollouts, for :meth:`load_state_dict`
-        """
         assert isinstance(self.replay_buffer, TaskHerReplayBuffer)
         return {**super().state_dict(), "replay": self.replay_buffer.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """
-        The random generators follow when ``learn(remaining steps, reset_num_timesteps=False)`` begins.
-
-        :param state: of :meth:`state_dict` of a model with the same settings
-        """
         super().load_state_dict(state)
         assert isinstance(self.replay_buffer, TaskHerReplayBuffer)
         self.replay_buffer.load_state_dict(state["replay"])

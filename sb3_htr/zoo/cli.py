@@ -85,7 +85,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def console() -> int:
     """
-    :return: exit status of :func:`main`; 1 and a sentence, without the way to it, for an error
+    :return: exit status of :func:`main`; 1 and a sentence, without the way to it, for an error; 130 after Ctrl-C
     """
     # Modules of one's own beside what one works on, as `python -m` has it
     sys.path.append(os.getcwd())
@@ -95,6 +95,9 @@ def console() -> int:
         # Whoever reads the output, as `head` does, has seen enough; nothing more can be written at the end either
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except KeyboardInterrupt:
+        print("sb3-htr: stopped", file=sys.stderr)
+        return 130
     except Exception as error:
         if os.environ.get("SB3_HTR_TRACEBACK"):
             raise

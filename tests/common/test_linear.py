@@ -1,15 +1,39 @@
 """Fast linear layers are linear layers."""
 
 import copy
+from types import SimpleNamespace
 
 import pytest
 import torch as th
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from sb3_htr.common.linear import MIN_ROWS, Linear, with_fast_linear
+from sb3_htr.common import linear
+from sb3_htr.common.linear import MIN_ROWS, Linear, Stack, find_onednn, with_fast_layers
 from sb3_htr.common.matmul import matmul_precision
+
+LAYERS = {
+    "encoder": [nn.Linear(5, 40), nn.ReLU(), nn.Linear(40, 64), nn.ReLU(), nn.Linear(64, 10)],
+    "critic": [
+        nn.Linear(5, 40),
+        nn.LayerNorm(40),
+        nn.ReLU(),
+        nn.Linear(40, 50),
+        nn.LayerNorm(50),
+        nn.ReLU(),
+        nn.Linear(50, 1),
+    ],
+    "actor": [nn.Linear(5, 40), nn.ReLU(), nn.Linear(40, 64), nn.ReLU()],
+    "normalized last": [nn.Linear(5, 64), nn.LayerNorm(64, eps=0.1)],
+    "other activations": [nn.Linear(5, 64), nn.Tanh(), nn.Linear(64, 2)],
+}
+
+
+@pytest.fixture
+def everything_through_onednn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Small products too."""
+    monkeypatch.setattr(linear, "MIN_MULTIPLICATIONS", 0)
 
 
 def gradients(layer: nn.Module, x: th.Tensor, loss_weight: th.Tensor) -> list[th.Tensor]:
@@ -21,6 +45,8 @@ def gradients(layer: nn.Module, x: th.Tensor, loss_weight: th.Tensor) -> list[th
     return [output.detach(), *(grad for grad in grads if grad is not None)]
 
 
+@pytest.mark.usefixtures("everything_through_onednn")
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.integers(1, 3 * MIN_ROWS), st.integers(1, 70), st.integers(1, 70), st.booleans(), st.integers(0, 99))
 def test_results_and_gradients_are_those_of_torch(n: int, n_in: int, n_out: int, strided: bool, seed: int) -> None:
     th.manual_seed(seed)
@@ -41,11 +67,57 @@ def test_other_types_and_lower_precision_are_left_to_torch(dtype: th.dtype) -> N
         th.testing.assert_close(layer(x), nn.functional.linear(x, layer.weight, layer.bias), rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("n_rows", [MIN_ROWS - 1, 4 * MIN_ROWS])
+@pytest.mark.parametrize("name", LAYERS)
+@pytest.mark.usefixtures("everything_through_onednn")
+def test_a_stack_is_a_sequence(name: str, n_rows: int) -> None:
+    th.manual_seed(0)
+    sequence = nn.Sequential(*copy.deepcopy(LAYERS[name]))
+    stack = with_fast_layers(copy.deepcopy(sequence))
+    assert isinstance(stack, Stack)
+    x = th.randn(n_rows, 5)
+    loss_weight = th.randn_like(sequence(x))
+    actual, expected = (gradients(layers, x, loss_weight) for layers in (stack, sequence))
+    th.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-4)
+    with th.no_grad():
+        th.testing.assert_close(stack(x), expected[0], rtol=1e-4, atol=1e-4)
+
+
+def test_what_does_not_learn_has_no_gradient_and_passes_one_on() -> None:
+    stack = with_fast_layers(nn.Sequential(*copy.deepcopy(LAYERS["critic"]))).requires_grad_(False)
+    x = th.randn(2 * MIN_ROWS, 5, requires_grad=True)
+    stack(x).sum().backward()
+    assert x.grad is not None and x.grad.abs().sum() > 0
+    assert all(parameter.grad is None for parameter in stack.parameters())
+
+
+def test_a_gradient_that_others_have_is_not_overwritten() -> None:
+    stack = with_fast_layers(nn.Sequential(*copy.deepcopy(LAYERS["actor"])))
+    output = stack(th.randn(2 * MIN_ROWS, 5))
+    given = th.randn_like(output)
+    before = given.clone()
+    output.backward(given)
+    assert th.equal(given, before)
+
+
+def test_a_torch_without_the_private_operation_uses_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert find_onednn() is not None, "the tested version of torch has it"
+    layer, x = Linear(64, 64), th.randn(1024, 64)
+    expected = layer(x).detach()
+    for namespace in (SimpleNamespace(), SimpleNamespace(_linear_pointwise=lambda x, *_: x)):
+        with monkeypatch.context() as patch:
+            patch.setattr(th.ops, "mkldnn", namespace)
+            assert find_onednn() is None
+            patch.setattr(linear, "onednn", find_onednn())
+            th.testing.assert_close(layer(x), nn.functional.linear(x, layer.weight, layer.bias), rtol=0, atol=0)
+    th.testing.assert_close(expected, nn.functional.linear(x, layer.weight, layer.bias), rtol=1e-4, atol=1e-4)
+
+
 def test_replaced_layers_keep_their_parameters() -> None:
-    module = nn.Sequential(nn.Linear(3, 4), nn.Sequential(nn.ReLU(), nn.Linear(4, 2)))
+    module = nn.ModuleList([nn.Linear(3, 4), nn.Sequential(nn.ReLU(), nn.Linear(4, 2))])
     before = copy.deepcopy(module.state_dict())
     parameters = list(module.parameters())
-    assert with_fast_linear(module) is module
-    assert isinstance(module[0], Linear) and isinstance(module[1][1], Linear)  # type: ignore[index]
+    assert with_fast_layers(module) is module
+    assert isinstance(module[0], Linear) and isinstance(module[1], Stack) and isinstance(module[1][1], Linear)
     assert all(a is b for a, b in zip(module.parameters(), parameters, strict=True))
     assert all(th.equal(before[name], value) for name, value in module.state_dict().items())

@@ -22,3 +22,11 @@ def test_only_same_step_autoreset_can_be_an_sb3_vec_env() -> None:
     env = gym.make_vec(ENV_ID, 2, vectorization_mode="sync")
     with pytest.raises(ValueError, match=r"expected AutoresetMode\.SAME_STEP"):
         BatchedTaskVecEnv(env)
+
+
+def test_a_batch_has_the_attributes_of_single_envs() -> None:
+    env = make_task_vec_env(ENV_ID, 2)
+    env.set_options([{"task_id": 1}, {"task_id": 3}])
+    env.reset()
+    assert env.has_attr("task_id") and env.get_attr("task_id", 1) == [3] and not env.has_attr("no_such_attribute")
+    assert env.has_attr("task") and len(env.get_attr("task")) == 2

@@ -1,12 +1,17 @@
 """The reliability diagram compares what the reward model says with what happened."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch as th
 
 from helpers import ENV_ID
+from htr_envs.point_robot import PointRobotDynamics
 from sb3_htr import PEARL
+from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.experiments.calibration import N_BINS, N_EPISODES, calibration, expected_calibration_error
+from sb3_htr.rivals.scripted import ScriptedAgent
 
 
 @pytest.fixture
@@ -32,6 +37,25 @@ def test_probabilities_are_compared_with_what_happened(model: PEARL, monkeypatch
     assert half[N_BINS // 2].tolist() == [n.sum(), n.sum() / 2, successes.sum()] and half.sum() == half[N_BINS // 2].sum()
     assert expected_calibration_error(half) == pytest.approx(abs(0.5 - successes.sum() / n.sum()))
     assert expected_calibration_error(bins) == pytest.approx(np.abs(probability - successes).sum() / n.sum())
+
+
+def test_a_success_may_be_worth_0_and_all_else_less(model: PEARL, monkeypatch: pytest.MonkeyPatch) -> None:
+    family = {"goal_distance": 0.5, "n_validation_tasks": 6}
+
+    def pairs_and_successes() -> list[float]:
+        walk = ScriptedAgent.random(make_task_vec_env(ENV_ID).action_space)  # type: ignore[arg-type]
+        monkeypatch.setattr(model, "start_adaptation", walk.start_adaptation)
+        return calibration(model, ENV_ID, family)[:, [0, 2]].sum(axis=0).tolist()
+
+    expected, step = pairs_and_successes(), PointRobotDynamics.step
+    assert min(expected) > 0
+
+    def paid(self: Any, actions: Any) -> Any:
+        states, rewards, terminated = step(self, actions)
+        return states, rewards - 1, terminated
+
+    monkeypatch.setattr(PointRobotDynamics, "step", paid)
+    assert pairs_and_successes() == expected
 
 
 def test_a_model_that_solves_nothing_has_no_diagram(model: PEARL) -> None:

@@ -21,6 +21,7 @@ from sb3_htr.experiments.driver import ATTEMPTS, Driver
 from sb3_htr.experiments.executors import Here, Processes
 from sb3_htr.experiments.grid import EXPERIMENTS, Experiment, Variant
 from sb3_htr.experiments.runner import claim, run_cell
+from sb3_htr.zoo.cli import main
 
 CELLS = Experiment("toy", "", "SparsePointRobot-v0", 1000, (Variant("htr-ser"), Variant("htr-ec", "K = 0.8")), 3).cells()
 Arrays = dict[str, Any]
@@ -173,3 +174,10 @@ def test_the_job_array_of_the_manual_runs_its_cell(tmp_path: Path) -> None:
     environment = {"PATH": f"{tmp_path}:/usr/bin:/bin", "SLURM_ARRAY_TASK_ID": "7"}
     said = subprocess.run(["bash", "-c", script], env=environment, capture_output=True, text=True, check=True).stdout
     assert said == "1: experiment point_robot --runs /shared/runs --cell 7\n"
+
+
+@pytest.mark.parametrize("option", ["--seeds", "--jobs"])
+@pytest.mark.parametrize("n", [0, -1])
+def test_no_runs_are_no_experiment(option: str, n: int, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=f"{option} is {n}, expected a whole number of at least 1"):
+        main(["experiment", "precision", option, str(n), "--runs", str(tmp_path)])

@@ -82,6 +82,25 @@ def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monk
     assert all(f"| {cell.n_timesteps:,} | 3 | {cell.variant} | `prior` | 2.0 [1." in headline for cell in shown)
 
 
+def test_agents_without_explorers_are_in_the_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[str] = []
+    monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 50)
+    monkeypatch.setattr(figures, "finish", lambda figure, *_: drawn.extend(figure.axes[1].get_legend_handles_labels()[1]))
+    figures.learning(made_up(EXPERIMENTS["rivals"].cells(1), tmp_path), tmp_path)
+    assert {"htr-ser, belief", "htr-ser, prior", "rl2, own", "sac-her, own"} <= set(drawn)
+
+
+def test_what_an_algorithm_does_not_tell_is_null(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """NaN is no JSON."""
+    monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 50)
+    results = made_up(EXPERIMENTS["held_out_sector"].cells(1), tmp_path)
+    for path in results.values():
+        np.savez(path, **{**np.load(path), "calibration": np.zeros((10, 3)), LOGGED[0]: np.nan})
+    summary = report.summarize("", results)
+    assert all(row["calibration_error"] is None and row[LOGGED[0]] is None for row in summary["rows"])
+    json.dumps(summary, allow_nan=False)
+
+
 @pytest.mark.parametrize("experiment", EXPERIMENTS.values(), ids=EXPERIMENTS)
 def test_the_grid_is_what_it_says(experiment: Any) -> None:
     cells = experiment.cells()

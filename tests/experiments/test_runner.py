@@ -73,6 +73,8 @@ def test_a_killed_run_goes_on_and_a_finished_one_is_tested(tmp_path: Path, monke
     assert (again["returns_prior"] == raw["returns_prior"]).all() and "returns_belief" not in again
     with pytest.raises(ValueError, match="seed 1, but other/tiny-n_test_tasks10-seed2 needs 2: move this run away"):
         find_finished(replace(others, seed=2), folder)
+    with pytest.raises(ValueError, match=r"has the settings .*'batch_size:4'.* needs .*'batch_size:5'"):
+        find_finished(replace(others, settings={**SMALL, "batch_size": 5}), folder)
     assert find_finished(replace(others, n_timesteps=1200), tmp_path / "nowhere") is None
 
 

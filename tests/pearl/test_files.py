@@ -190,6 +190,8 @@ def test_a_replay_buffer_of_other_settings_is_refused(tiny_pearl: MakePEARL, tmp
         tiny_pearl(buffer_size=10_000).load_replay_buffer(tmp_path / "buffer")
     with pytest.raises(ValueError, match="pass env="):
         PEARL("MlpPolicy", None, _init_setup_model=False).load_replay_buffer(tmp_path / "buffer")
+    with pytest.raises(ValueError, match="no env, so it has no replay buffer"):
+        PEARL("MlpPolicy", None, _init_setup_model=False).save_replay_buffer(tmp_path / "other")
 
 
 def test_streams_work_as_files_do(tiny_pearl: MakePEARL) -> None:

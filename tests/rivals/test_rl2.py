@@ -105,6 +105,8 @@ def test_it_learns_and_is_the_same_after_save_and_load(tmp_path: Any) -> None:
     loaded.set_env(make_task_vec_env(ENV_ID, 2))
     loaded.learn(80, reset_num_timesteps=False)
     assert loaded.num_timesteps == 240
+    with pytest.raises(ValueError, match="this env are rollouts of 20 steps, but those of the model have 40"):
+        loaded.set_env(make_task_vec_env(ENV_ID, 2, env_kwargs={"max_episode_steps": 10}))
 
 
 def test_a_rollout_is_whole_trials_and_a_minibatch_some_of_them() -> None:

@@ -64,10 +64,10 @@ def test_agents_that_are_not_there_are_said_to_be_so(tmp_path: Path, tiny_pearl:
         ([str(tmp_path / "absent")], "absent does not exist: give a run folder"),
         ([str(tmp_path / "loose.zip")], "does not say which env it was trained on: add --env ID"),
         ([*NOWHERE, "--task", "101"], "There is no test task 101: --task takes numbers from 1 to 100"),
-        ([*NOWHERE, "--n-tasks", "0"], "--n-tasks is 0, expected at least 1"),
+        ([*NOWHERE, "--n-tasks", "0"], "--n-tasks is 0, expected a whole number of at least 1"),
         ([*NOWHERE, "--device", "cudaa"], "The device 'cudaa' cannot be used: give cpu, cuda or cuda:N"),
         ([str(SHIPPED), "--env", "SparseAnt-v0"], "was trained on SparsePointRobot-v0, but --env is SparseAnt-v0"),
-        ([*NOWHERE, "--n-episodes", "0"], "--n-episodes is 0, expected at least 1"),
+        ([*NOWHERE, "--n-episodes", "0"], "--n-episodes is 0, expected a whole number of at least 1"),
         ([*NOWHERE, "--gym-packages", "no_such_module"], "The module no_such_module is asked for, but not found"),
     ):
         with pytest.raises((ValueError, FileNotFoundError), match=message):
@@ -180,6 +180,12 @@ def test_the_console_answers_mistakes_in_one_sentence(
     monkeypatch.setenv("SB3_HTR_TRACEBACK", "1")
     with pytest.raises(ValueError):
         cli.console()
+
+    def interrupt(argv: object = None) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "main", interrupt)
+    assert cli.console() == 130 and "stopped" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", cli.COMMANDS)

@@ -164,7 +164,7 @@ def test_tensorboard_shows_each_point_once(tmp_path: Path) -> None:
 def test_a_run_goes_on_from_another_folder_than_it_was_begun_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "there").mkdir()
     monkeypatch.chdir(tmp_path / "there")
-    shutil.copy(hyperparams_file(), "my.yml")
+    shutil.copy(hyperparams_file("pearl.yml"), "my.yml")
     arguments = [word if word != str(STEPS) else "480" for word in TRAIN]
     assert main([*arguments, "-conf", "my.yml", "-f", "runs"]) == 0
     run = run_folder(Path("runs").resolve())

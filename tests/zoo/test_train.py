@@ -162,7 +162,7 @@ def test_a_trial_can_be_pruned(tmp_path: Path) -> None:
 
 
 def test_every_hyperparameter_names_its_source() -> None:
-    for file in sorted(set(hyperparams_file().parent.glob("*.yml")) - {hyperparams_file("methods.yml")}):
+    for file in sorted(set(hyperparams_file("pearl.yml").parent.glob("*.yml")) - {hyperparams_file("methods.yml")}):
         for number, line in enumerate(file.read_text().splitlines(), start=1):
             if re.match(r"\s+\w+: *[^&* ]", line) and not line.strip().startswith("#"):
                 assert "# " in line, f"{file.name}, line {number}: {line.strip()} has no source"
@@ -176,7 +176,7 @@ def test_every_hyperparameter_names_its_source() -> None:
 
 
 def blocks() -> list[tuple[str, str]]:
-    files = sorted(hyperparams_file().parent.glob("pearl*.yml"))
+    files = sorted(hyperparams_file("pearl.yml").parent.glob("pearl*.yml"))
     return [(file.name, key) for file in files for key in yaml.safe_load(file.read_text())]
 
 

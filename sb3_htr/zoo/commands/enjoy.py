@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sb3_htr.common.checks import get_task_family
+from sb3_htr.common.checks import check_numbers, get_task_family
 from sb3_htr.zoo.commands.arguments import add_adaptation_arguments, add_agent_arguments, make_parser, parse
 from sb3_htr.zoo.run.agents import TrainedAgent
 from sb3_htr.zoo.show.play import Moment, Player, heading, line, summary
@@ -50,10 +50,8 @@ def watch(agent: TrainedAgent, args: argparse.Namespace, every: int, show: Show)
     env = agent.make_env("rgb_array" if every else None)
     player = Player(model, env, args.explorer, not args.stochastic, args.seed, every)
     tasks: np.ndarray = getattr(get_task_family(player.vec_env), f"{args.tasks}_tasks")
-    if args.n_episodes < 1:
-        raise ValueError(f"--n-episodes is {args.n_episodes}, expected at least 1.")
-    if args.n_tasks < 1:
-        raise ValueError(f"--n-tasks is {args.n_tasks}, expected at least 1.")
+    infinity = float("inf")
+    check_numbers(**{"--n-episodes": (args.n_episodes, 1, infinity), "--n-tasks": (args.n_tasks, 1, infinity)})
     numbers = args.task or range(1, min(args.n_tasks, len(tasks)) + 1)
     wrong = [number for number in numbers if not 1 <= number <= len(tasks)]
     if wrong:

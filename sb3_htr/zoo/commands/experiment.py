@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from sb3_htr.common.checks import check_numbers
 from sb3_htr.zoo.commands.arguments import OF_PACKAGES, make_parser
 from sb3_htr.zoo.run.trust import import_packages
 
@@ -40,6 +41,8 @@ def main(argv: Sequence[str]) -> None:
     where.add_argument("--ray", metavar="ADDRESS", help="run on a Ray cluster; auto for the one of this machine")
     where.add_argument("--cell", type=int, metavar="I", help="run number I alone, from 0, for job arrays; writes no results")
     args = parser.parse_args(argv)
+    given = {"--seeds": args.seeds, "--jobs": args.jobs}
+    check_numbers(**{name: (n, 1, float("inf")) for name, n in given.items() if n is not None})
     experiment = grid.EXPERIMENTS[args.name]
     cells = experiment.cells(1, 0.1) if args.quick else experiment.cells(args.seeds)
     cells = [replace(cell, gym_packages=tuple(packages)) for cell in cells]

@@ -17,6 +17,7 @@ from sb3_htr.zoo.plots.adaptation import plot_adaptation_curve, plot_adaptation_
 from sb3_htr.zoo.plots.curves import Curve, plot_curves
 from sb3_htr.zoo.plots.latent import plot_latent_space
 from sb3_htr.zoo.run.agents import TrainedAgent, find_runs
+from sb3_htr.zoo.run.solved import time_to_solved
 
 EXAMPLE = """  sb3-htr plot --env SparsePointRobot-v0                  an agent that comes with the package
   sb3-htr plot runs/htr runs/sparse -l HTR "no relabelling"    the runs in a folder are the seeds of its curve
@@ -153,6 +154,19 @@ def learning_curve(label: str, agents: Sequence[TrainedAgent]) -> Curve | None:
     return Curve(steps / 1000, returns, successes, agents[0].method)
 
 
+def print_time_to_solved(groups: dict[str, list[TrainedAgent]]) -> None:
+    """
+    :param groups: label and runs of each curve: one line for each of them, with the median over runs
+    """
+    for label, agents in groups.items():
+        times = [time for agent in agents if agent.folder is not None and (time := time_to_solved(agent.folder)) is not None]
+        if times:
+            steps, seconds = np.median(times, axis=0)
+            clock = "" if np.isnan(seconds) else f", {seconds:,.0f} seconds with evaluations"
+            runs = f" (median of {len(times)} runs)" if len(times) > 1 else ""
+            print(f"{label}: 95 % of the last evaluation's return after {steps:,.0f} env steps{clock}{runs}")
+
+
 def main(argv: Sequence[str]) -> None:
     """The command, with its arguments."""
     description = "Pictures of one or several runs: learning curves, return per adaptation episode, paths, latent space."
@@ -179,6 +193,7 @@ def main(argv: Sequence[str]) -> None:
             names = [agent.explorer for agents in groups.values() for agent in agents]
             about = f"{env_id}, validation tasks, {about_explorers(names)}"
             plot_curves(learning, new("learning_curves"), about, "thousand env steps of meta-training", labels)
+            print_time_to_solved(groups)
         else:
             print("No learning curves: there is no evaluations.npz of a training.")
     if set(args.only) != {"learning"}:

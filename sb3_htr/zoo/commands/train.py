@@ -89,9 +89,9 @@ def main(argv: Sequence[str]) -> None:
         # Later arguments win, so these are defaults. One thread: two runs on two cores must not fight for them.
         defaults = ["--algo", algorithm.name, "-conf", algorithm.settings_file, "--num-threads", "1", "--save-freq", "20000"]
         packages = ["--gym-packages", *args.gym_packages] if args.gym_packages else []
-        for before, word in list(pairwise(rest)):
+        for i, (before, word) in enumerate(pairwise(rest), start=1):
             if before in CONF and Path(word).exists():
-                rest[rest.index(word)] = str(Path(word).resolve())  # wherever the run goes on from
+                rest[i] = str(Path(word).resolve())  # wherever the run goes on from
         arguments = [*defaults, *env, *rest, *packages]
         find_hidden(args.env or "")
     keep_freed_memory()

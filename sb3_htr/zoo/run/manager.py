@@ -117,8 +117,8 @@ class MetaExperimentManager(ExperimentManager):
     ) -> tuple[dict[str, Any], Callable[..., Any] | None, list[BaseCallback], Callable[..., Any] | None]:
         if "normalize" in hyperparams:
             raise ValueError(
-                "normalize asks for SB3's VecNormalize, which is not saved with the model: write policy_kwargs: "
-                "{normalize_observations: true} in its place."
+                "normalize asks for SB3's VecNormalize, which is not saved with the model: leave it away, the policy "
+                "normalizes observations itself (normalize_observations of policy_kwargs)."
             )
         model_class = self.method.algorithm.model_class()
         check_keywords(model_class.__name__, hyperparams, model_class, also=ZOO_SETTINGS)

@@ -26,13 +26,11 @@ class Method:
     An algorithm, and everything that two methods may differ in; all else is a setting of the env.
 
     :param name: in commands, folders, tables and pictures
-    :param label: for people
     :param about: what it is, for model cards
-    :param algorithm: name of the algorithm
+    :param algorithm_name: of what trains it, see :data:`sb3_htr.zoo.run.algorithm.ALGORITHMS`
     """
 
     name: str
-    label: str
     about: str
     algorithm_name: str
 
@@ -110,13 +108,7 @@ class PEARLMethod(Method):
         """
         :return: the same method under PEARL's own protocol
         """
-        return replace(
-            self,
-            name=f"{self.name}{PRIOR}",
-            label=f"{self.label}, PEARL's protocol",
-            train_explorer="prior",
-            explorer="prior",
-        )
+        return replace(self, name=f"{self.name}{PRIOR}", train_explorer="prior", explorer="prior")
 
 
 @cache
@@ -130,9 +122,9 @@ def methods() -> dict[str, Method]:
     return {method.name: method for method in (*own, *under_prior)}
 
 
-def _method(name: str, label: str, about: str = "", algorithm: str = "pearl", **settings: Any) -> Method:
+def _method(name: str, about: str, algorithm: str = "pearl", **settings: Any) -> Method:
     kind = PEARLMethod if algorithm == "pearl" else Method
-    return kind(name, label, " ".join(about.split()), algorithm, **settings)
+    return kind(name, " ".join(about.split()), algorithm, **settings)
 
 
 def register_method(name: str, **settings: Any) -> None:
@@ -141,7 +133,7 @@ def register_method(name: str, **settings: Any) -> None:
     which ``--gym-packages`` names, it is at hand in all commands.
 
     :param name: that no other method has
-    :param settings: what a block of ``hyperparams/methods.yml`` says: ``label``, ``about``, ``algorithm``, and for PEARL what
+    :param settings: what a block of ``hyperparams/methods.yml`` says: ``about``, ``algorithm``, and for PEARL what
         :class:`PEARLMethod` has
     :raises ValueError: for a name that is taken, settings that are missing or not there, or an unknown relabeller, explorer
         or algorithm

@@ -14,7 +14,7 @@ def shipped(name: str) -> Path:
     return inside if inside.is_dir() else PACKAGE.parent / name
 
 
-def hyperparams_file(name: str = "pearl.yml") -> Path:
+def hyperparams_file(name: str) -> Path:
     """
     :param name: file name
     :return: its path

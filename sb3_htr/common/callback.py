@@ -1,0 +1,15 @@
+"""Callbacks of an algorithm beside those of its user."""
+
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
+from stable_baselines3.common.type_aliases import MaybeCallback
+
+
+def followed_by(callback: MaybeCallback, last: BaseCallback) -> CallbackList:
+    """
+    :param callback: of a user, in any form that ``learn`` takes
+    :param last: called after it
+    :return: both, not initialized yet: what a callback sets up is to be set up once
+    """
+    if isinstance(callback, list):
+        callback = CallbackList(callback)
+    return CallbackList([callback if isinstance(callback, BaseCallback) else ConvertCallback(callback), last])

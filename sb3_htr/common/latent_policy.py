@@ -1,0 +1,54 @@
+"""What a policy is that acts on an observation and a task variable z."""
+
+from abc import abstractmethod
+from typing import TypeAlias
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import PyTorchObs
+
+from sb3_htr.common.normalizer import ObservationNormalizer
+
+# Of SB3's predict()
+Obs: TypeAlias = np.ndarray | dict[str, np.ndarray]
+State: TypeAlias = tuple[np.ndarray, ...] | None
+
+
+class LatentPolicy(BasePolicy):
+    """A policy of Stable-Baselines3 for which the state of ``predict`` is z."""
+
+    latent_dim: int
+    normalizer: ObservationNormalizer | None
+    _z: th.Tensor
+
+    def predict(
+        self, observation: Obs, state: State = None, episode_start: np.ndarray | None = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, State]:
+        """
+        :param observation: (obs_dim,) or (n, obs_dim)
+        :param state: tuple of one array, z of each observation (n, latent_dim); None is the prior mean
+        :param episode_start: ignored: z lives longer than an episode
+        :param deterministic: mean action instead of a sample
+        :return: actions, and the state for the next call
+        """
+        z = np.zeros((1, self.latent_dim), dtype=np.float32) if state is None else state[0]
+        self._z = th.as_tensor(z, dtype=th.float32, device=self.device)
+        actions, _ = super().predict(observation, None, episode_start, deterministic)
+        return actions, (z,)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        assert isinstance(observation, th.Tensor)
+        obs = self.normalize(observation.flatten(1).float())
+        return self._act(th.cat([obs, self._z.expand(len(obs), -1)], dim=1), deterministic)
+
+    def normalize(self, obs: th.Tensor) -> th.Tensor:
+        """
+        :param obs: (n, obs_dim), as the env gave them
+        :return: the same shape, as all networks see them
+        """
+        return obs if self.normalizer is None else self.normalizer(obs)
+
+    @abstractmethod
+    def _act(self, obs_z: th.Tensor, deterministic: bool) -> th.Tensor:
+        """Actions (n, action_dim), scaled to [-1, 1], for normalized observations and z (n, obs_dim + latent_dim)."""
