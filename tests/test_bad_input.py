@@ -56,7 +56,10 @@ class WithoutHook(gym.Wrapper[Any, Any, Any, Any]):
             lambda: gym.make_vec(ENV_ID, 2),
             "is a gymnasium VectorEnv, expected one of Stable-Baselines3: pass the env's id",
         ),
-        (lambda: VecNormalize(make_task_vec_env(ENV_ID, 2)), "VecNormalize stands between .*the policy normalizes observations itself"),
+        (
+            lambda: VecNormalize(make_task_vec_env(ENV_ID, 2)),
+            "VecNormalize stands between .*the policy normalizes observations itself",
+        ),
         (lambda: DummyVecEnv([lambda: gym.make("Pendulum-v1")]), "no task_family"),
     ],
 )
