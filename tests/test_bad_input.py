@@ -304,7 +304,7 @@ def test_a_window_without_a_screen_is_refused_with_what_to_do(monkeypatch: pytes
             ["--env", ENV_ID, "--trial-id", "9", "--study-name", "s", "--storage", "sqlite:///:memory:"],
             "no study 's' with a trial 9",
         ),
-        (["--env", "Speed-v0", "--gym-packages", "not_there"], "needs the module not_there, which is not found: install it"),
+        (["--env", "Speed-v0", "--gym-packages", "not_there"], "The module not_there is asked for, but not found: install it"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from helpers import ENV_ID, ROLLOUT, MakePEARL
+from helpers import ENV_ID, ROLLOUT, MakePEARL, with_policy
 from htr_envs import PointRobotFamily
 from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.adaptation import MetaEvalCallback
@@ -40,7 +40,8 @@ def test_meta_eval_is_on_validation_tasks_unless_told(tmp_path: Path) -> None:
 
 def test_meta_eval_explores_as_it_is_told(tiny_pearl: MakePEARL) -> None:
     env, prior = make_task_vec_env(ENV_ID, 20), {"name": "prior", "n_exploration_episodes": 9}
-    model = tiny_pearl(learning_starts=1000)
+    # Otherwise what observations are normalized by follows the rollout, at whose last step the callback comes
+    model = tiny_pearl(learning_starts=1000, policy_kwargs=with_policy(normalize_observations=False))
     callback = MetaEvalCallback(env, explorer=prior, eval_freq=60, n_adaptation_episodes=2, verbose=0)
     model.learn(ROLLOUT, callback=callback)
     expected, _ = evaluate_adaptation(model, env, callback.tasks, n_episodes=2, explorer=prior)
