@@ -30,7 +30,12 @@ PAPER_SIZES: dict[str, Any] = {
     "meta_batch_size": 16,
     "batch_size": 256,
     "context_size": 1024,
-    "policy_kwargs": {"net_arch": [300] * 3, "encoder_arch": [200] * 3, "latent_dim": 5},
+    "policy_kwargs": {
+        "net_arch": [300] * 3,
+        "encoder_arch": [200] * 3,
+        "latent_dim": 5,
+        "normalize_observations": False,
+    },
 }
 
 
