@@ -231,7 +231,8 @@ def plot_adapted(
             labels = ("return", "share of tasks solved (%)")
             plot_curves(curves, new("adaptation_curve"), about, "adaptation episode", labels)
     if "paths" in args.only and first.tasks.shape[1] == 2:
-        title = f"{env_id}, {label}, {args.tasks} tasks, explorer {first.explorer}"
+        # The label of --env is the env
+        title = ", ".join(dict.fromkeys((env_id, label, f"{args.tasks} tasks", f"explorer {first.explorer}")))
         plot_adaptation_paths(first.record, first.tasks, first.goal_radius, first.start, new("adaptation_paths"), title)
     latent = first.latent
     if "latent" in args.only and latent is None:
