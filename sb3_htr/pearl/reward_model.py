@@ -1,11 +1,9 @@
 """A learned model of rewards, by which tasks that nobody listed can be told apart."""
 
 from itertools import pairwise
-from typing import Any
 
 import torch as th
 from torch import nn
-from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from sb3_htr.common.linear import with_fast_layers
@@ -15,8 +13,6 @@ from sb3_htr.common.type_aliases import RewardLabels
 MIN_LOG_STD = -3.5
 # How fast the mean reward of a success is followed
 SCALE_RATE = 0.01
-# Added to squared distances, whose roots have a gradient at 0 with it
-MIN_SQUARE = 1e-4
 
 
 def _mlp(units: list[int]) -> nn.Module:
@@ -84,7 +80,7 @@ class RewardModel(nn.Module):
         :return: (..., n, m), mean reward, beside the task-free one, where a state solves a task
         """
         distance = _squared_distance(states[..., self.width :], tasks[..., self.width : -1])
-        return tasks[..., None, :, -1] - (distance.clamp(min=0) + MIN_SQUARE).sqrt()
+        return tasks[..., None, :, -1] - (distance.clamp(min=0) + 1e-4).sqrt()
 
     def losses(self, next_obs: th.Tensor, z: th.Tensor, labels: RewardLabels) -> tuple[th.Tensor, th.Tensor]:
         """
@@ -99,81 +95,17 @@ class RewardModel(nn.Module):
         states, tasks = self.state_tower(next_obs), self.task_tower(z)
         # z that was inferred without a reward can be of any task
         weight = labels.inferred / (labels.inferred.sum().clamp(min=1) * len(states))
+        success = (labels.reward > 0).to(labels.reward.dtype)
+        cross_entropy = F.binary_cross_entropy_with_logits(self.success_logits(states, tasks), success, reduction="none")
         with th.no_grad():
-            n_successes = (labels.reward > 0).sum()
+            n_successes = success.sum()
             mean = labels.reward.sum() / n_successes.clamp(min=1)
             rate = th.where(self.scale > 0, SCALE_RATE, 1.0) * (n_successes > 0)
             self.scale.lerp_(mean, rate)
-        scale = self.scale.clamp(min=1e-6)
-        success_loss, reward_loss = _PairLosses.apply(
-            states, tasks, self.raw_sharpness, self.log_std, labels.reward, weight, scale
-        )
-        return success_loss, reward_loss
-
-
-class _PairLosses(th.autograd.Function):
-    """
-    The two losses of all pairs of a state and a task, in half of autograd's operations: their gradients are known as soon as
-    they are. Both distances of a pair, that of its success and that of its reward, are one product of batches of two.
-    """
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        states: th.Tensor,
-        tasks: th.Tensor,
-        raw_sharpness: th.Tensor,
-        log_std: th.Tensor,
-        reward: th.Tensor,
-        weight: th.Tensor,
-        scale: th.Tensor,
-    ) -> tuple[th.Tensor, th.Tensor]:
-        s, t = _by_distance(states), _by_distance(tasks[:, :-1])
-        squares = s.square().sum(dim=2)[:, :, None] + t.square().sum(dim=2)[:, None]
-        distance = th.baddbmm(squares, s, t.mT, alpha=-2)
-        grad = th.empty_like(distance)
-
-        success = (reward > 0).to(reward.dtype)
-        closeness, sharpness = 1 - distance[0], F.softplus(raw_sharpness)
-        logits = sharpness * closeness
-        success_loss = F.binary_cross_entropy_with_logits(logits, success, weight, reduction="sum")
-        error = (logits.sigmoid() - success) * weight
-        grad_sharpness = (error * closeness).sum() * raw_sharpness.sigmoid()
-        th.mul(error, -sharpness, out=grad[0])
-
-        success *= weight
-        root = (distance[1].clamp(min=0) + MIN_SQUARE).sqrt()
-        error = (tasks[:, -1] - root - reward) / scale
-        bounded = log_std.clamp(min=MIN_LOG_STD)
-        precision = (-2 * bounded).exp()
-        half_square, total = 0.5 * precision * (error.square() * success).sum(), success.sum()
-        reward_loss = half_square + bounded * total
-        error *= success * (precision / scale)
-        th.div(error, root, out=grad[1]).mul_(-0.5 * (distance[1] >= 0))
-        grad_log_std = (total - 2 * half_square) * (log_std >= MIN_LOG_STD)
-
-        grad_s = th.baddbmm(grad.sum(dim=2)[..., None] * s, grad, t, beta=2, alpha=-2)
-        grad_t = th.baddbmm(grad.sum(dim=1)[..., None] * t, grad.mT, s, beta=2, alpha=-2)
-        ctx.save_for_backward(grad_s, grad_t, error.sum(dim=0), grad_sharpness, grad_log_std)
-        return success_loss, reward_loss
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, of_success: th.Tensor, of_reward: th.Tensor) -> tuple[th.Tensor | None, ...]:
-        s, t, offset, sharpness, log_std = ctx.saved_tensors
-        factor = th.stack([of_success, of_reward])[:, None, None]
-        tasks = th.cat([_by_row(factor * t), (of_reward * offset)[:, None]], dim=1)
-        return _by_row(factor * s), tasks, of_success * sharpness, of_reward * log_std, None, None, None
-
-
-def _by_distance(x: th.Tensor) -> th.Tensor:
-    """(n, 2 * width) to (2, n, width)."""
-    return x.unflatten(1, (2, -1)).transpose(0, 1)
-
-
-def _by_row(x: th.Tensor) -> th.Tensor:
-    """(2, n, width) to (n, 2 * width)."""
-    return x.transpose(0, 1).flatten(1)
+        log_std = self.log_std.clamp(min=MIN_LOG_STD)
+        error = (self.success_rewards(states, tasks) - labels.reward) / self.scale.clamp(min=1e-6)
+        nll = 0.5 * error.square() * (-2 * log_std).exp() + log_std
+        return (cross_entropy * weight).sum(), (nll * success * weight).sum()
 
 
 def _squared_distance(x: th.Tensor, y: th.Tensor) -> th.Tensor:

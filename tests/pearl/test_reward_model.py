@@ -1,45 +1,52 @@
-"""The reward model's losses, whose gradients are written by hand."""
+"""The model of rewards learns which states solve which tasks, and what they return."""
 
 import pytest
 import torch as th
-from torch.nn import functional as F
 
 from sb3_htr.common.type_aliases import RewardLabels
-from sb3_htr.pearl.reward_model import MIN_LOG_STD, RewardModel
+from sb3_htr.pearl.reward_model import RewardModel
 
-N_STATES, N_TASKS, LATENT_DIM = 30, 8, 3
-
-
-def by_autograd(model: RewardModel, next_obs: th.Tensor, z: th.Tensor, labels: RewardLabels) -> th.Tensor:
-    """What the losses are defined as, added up with different weights."""
-    states, tasks = model.state_tower(next_obs), model.task_tower(z)
-    weight = labels.inferred / (labels.inferred.sum().clamp(min=1) * len(states))
-    success = (labels.reward > 0).float()
-    cross_entropy = F.binary_cross_entropy_with_logits(model.success_logits(states, tasks), success, reduction="none")
-    log_std = model.log_std.clamp(min=MIN_LOG_STD)
-    error = (model.success_rewards(states, tasks) - labels.reward) / model.scale.clamp(min=1e-6)
-    likelihood = 0.5 * error.square() * (-2 * log_std).exp() + log_std
-    return 2 * (cross_entropy * weight).sum() + 3 * (likelihood * success * weight).sum()
+RADIUS = 0.4
 
 
-@pytest.mark.parametrize("log_std", [-1.0, MIN_LOG_STD - 1])
-@pytest.mark.parametrize("share_of_successes", [0.2, 0.0])
-@pytest.mark.parametrize("share_of_inferred", [0.7, 0.0])
-def test_losses_and_gradients_are_those_of_autograd(
-    log_std: float, share_of_successes: float, share_of_inferred: float
-) -> None:
+def labelled(n_states: int, goals: th.Tensor, inferred: th.Tensor) -> tuple[th.Tensor, RewardLabels]:
+    """States of a square, and what they return near each goal: 1 less the distance."""
+    states = 2 * th.rand(n_states, 2) - 1
+    distance = th.cdist(states, goals)
+    reward = (1 - distance) * (distance < RADIUS)
+    return states, RewardLabels(th.arange(n_states), reward, th.zeros(n_states), inferred)
+
+
+def test_it_learns_what_solves_a_task_and_what_that_returns() -> None:
     th.manual_seed(0)
-    model = RewardModel(2, 2, LATENT_DIM)
-    model.log_std.data.fill_(log_std)
-    model.scale.fill_(0.8)
-    next_obs, z = th.randn(N_STATES, 2), th.randn(N_TASKS, LATENT_DIM, requires_grad=True)
-    reward = th.rand(N_STATES, N_TASKS) * (th.rand(N_STATES, N_TASKS) < share_of_successes)
-    inferred = (th.rand(N_TASKS) < share_of_inferred).float()
-    labels = RewardLabels(th.arange(N_STATES), reward, th.zeros(N_STATES), inferred)
-    learning = [z, *model.state_tower.parameters(), *model.task_tower.parameters(), model.raw_sharpness, model.log_std]
-    success_loss, reward_loss = model.losses(next_obs, z, labels)
-    actual = 2 * success_loss + 3 * reward_loss
-    # The scale has followed the rewards: it is the same for both
-    expected = by_autograd(model, next_obs, z, labels)
-    th.testing.assert_close(actual, expected)
-    th.testing.assert_close(th.autograd.grad(actual, learning), th.autograd.grad(expected, learning))
+    model = RewardModel(2, 1, 2)
+    optimizer = th.optim.Adam(model.parameters(), 3e-3)
+    for _ in range(400):
+        goals = 2 * th.rand(32, 2) - 1
+        states, labels = labelled(128, goals, th.ones(32))
+        loss = sum(model.losses(states, goals, labels), start=th.zeros(()))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    goals = 2 * th.rand(32, 2) - 1
+    states, labels = labelled(1000, goals, th.ones(32))
+    with th.no_grad():
+        states, tasks = model.state_tower(states), model.task_tower(goals)
+        chance, reward = model.success_logits(states, tasks).sigmoid(), model.success_rewards(states, tasks)
+    success = labels.reward > 0
+    assert chance[success].mean() > 0.7 and chance[~success].mean() < 0.05
+    assert chance.mean().item() == pytest.approx(success.float().mean().item(), abs=0.02), "as often as it happens"
+    assert (reward - labels.reward)[success].abs().mean() < 0.05
+    assert model.log_std < -1.2, "surer than it began, at -1"
+    assert model.scale.item() == pytest.approx(labels.reward[success].mean().item(), abs=0.05)
+
+
+def test_a_task_of_which_nothing_was_rewarded_teaches_nothing() -> None:
+    """Its z can be that of any task."""
+    th.manual_seed(0)
+    model, goals = RewardModel(2, 1, 2), th.rand(8, 2, requires_grad=True)
+    states, labels = labelled(64, goals.detach(), (th.arange(8) < 4).float())
+    (of_goals,) = th.autograd.grad(sum(model.losses(states, goals, labels), start=th.zeros(())), [goals])
+    assert of_goals[:4].abs().sum() > 0 and not of_goals[4:].any()
+    nothing = labels._replace(inferred=th.zeros(8))
+    assert [loss.item() for loss in model.losses(states, goals, nothing)] == [0.0, 0.0]
