@@ -164,7 +164,7 @@ def print_time_to_solved(groups: dict[str, list[TrainedAgent]]) -> None:
             steps, seconds = np.median(times, axis=0)
             clock = "" if np.isnan(seconds) else f", {seconds:,.0f} seconds with evaluations"
             runs = f" (median of {len(times)} runs)" if len(times) > 1 else ""
-            print(f"{label}: 95 % of the last evaluation's return after {steps:,.0f} env steps{clock}{runs}")
+            print(f"{label}: 95 % of the way to its last return after {steps:,.0f} env steps{clock}{runs}")
 
 
 def main(argv: Sequence[str]) -> None:
