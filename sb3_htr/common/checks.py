@@ -35,6 +35,15 @@ def check_is_no_gymnasium_vector_env(env: Any) -> None:
         )
 
 
+def check_has_env(env: VecEnv | None) -> None:
+    """
+    :param env: of a model that is to learn
+    :raises ValueError: if there is none
+    """
+    if env is None:
+        raise ValueError("The model was loaded without an env, which learning needs: pass env to load, or call set_env.")
+
+
 def check_spaces(env: VecEnv) -> None:
     """
     :param env: env to train on

@@ -242,9 +242,9 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
         :return: self
         :raises ValueError: for a model that was loaded without an env
         """
-        if self.replay_buffer is None:
-            raise ValueError("The model was loaded without an env, which learning needs: pass env to load, or call set_env.")
+        checks.check_has_env(self.env)
         if total_timesteps is None:
+            assert self.replay_buffer is not None
             total_timesteps = timesteps_for(self.replay_buffer.max_episode_steps)
         return super().learn(
             total_timesteps=total_timesteps,

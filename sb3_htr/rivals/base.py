@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_htr.adaptation.adaptation import Step
 from sb3_htr.adaptation.loop import Watched
 from sb3_htr.common.callback import followed_by
+from sb3_htr.common.checks import check_has_env
 from sb3_htr.common.saving import AtomicSave
 from sb3_htr.common.training_state import get_training_state, set_random_state, set_training_state
 
@@ -143,8 +144,8 @@ class Rival(AtomicSave, BaseAlgorithm):
         return super()._init_callback(followed_by(callback, FreshStart()), progress_bar)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        if self.env is None:
-            raise ValueError("The model was loaded without an env, which learning needs: pass env to load, or call set_env.")
+        check_has_env(self.env)
+        assert self.env is not None
         result = super()._setup_learn(*args, **kwargs)
         if self._pending_random is not None:
             set_random_state(self.env, self._pending_random)
