@@ -148,7 +148,9 @@ class LatentKnowledge(nn.Module):
         unrewarded = beside[~success].quantile(UNREWARDED) if (~success).any() else th.zeros(())
         rewarded = beside[success].quantile(REWARDED)
         self.threshold.copy_((unrewarded + rewarded) / 2)
-        return Particles(z, earned / n_rewarded, share * returns[:, None], _log_prior(z, overlap, is_train), is_train)
+        log_prior = _log_prior(z, overlap, is_train)
+        bank.rank(log_prior.cpu().numpy())
+        return Particles(z, earned / n_rewarded, share * returns[:, None], log_prior, is_train)
 
     def set_particles(self, particles: Particles) -> None:
         """

@@ -14,8 +14,8 @@ from sb3_htr.htr.transitions import Transitions
 
 # Training tasks that are in the bank; of more, evenly spread ones. The cost of an episode is flat from there on
 MAX_TRAIN_TASKS = 128
-# Hindsight tasks; of more, a random one makes room
-MAX_HINDSIGHT_TASKS = 256
+# Hindsight tasks. Of more, the least likely ones make room, so many in an update: newcomers are judged later
+MAX_HINDSIGHT_TASKS, MAX_REPLACED = 256, 32
 # Steps of each new episode that may become hindsight tasks
 N_CANDIDATES = 8
 # Episodes rewarded under all tasks at a time, to bound memory
@@ -42,12 +42,13 @@ class SolvedTasks(NamedTuple):
 
 class TaskBank:
     """
-    Training tasks, and hindsight tasks packed evenly over all that was reached, each with the best of all episodes of
+    Training tasks, and hindsight tasks packed evenly over what was reached, each with the best of all episodes of
     meta-training, whatever task they were collected on.
 
     It is hindsight relabelling once more: each new episode is rewarded under all these tasks. A state that solves none of the
-    hindsight tasks becomes one, so that they are as far apart as a task reaches, whatever tasks are. What it keeps of an
-    episode is what its context would be. Where the family tells no successes, the bank stays empty.
+    hindsight tasks becomes one, so that they are as far apart as a task reaches, whatever tasks are; where more was reached
+    than it has room for, it keeps those that resemble training tasks most. What it keeps of an episode is what its context
+    would be. Where the family tells no successes, the bank stays empty.
 
     :param task_family: reward hook and training tasks
     :param transitions: columns of an episode's rows
@@ -66,6 +67,8 @@ class TaskBank:
         self.best_return = np.zeros(self.n_train, dtype=np.float32)
         self.length = np.zeros(self.n_train, dtype=np.int64)
         self.episodes = np.zeros((self.n_train, context_size, transitions.width), dtype=np.float32)
+        # How likely an unknown task is to be like each; infinite for training tasks, and for those that were not judged yet
+        self.likelihood = np.full(self.n_train, np.inf)
         self.seed(seed)
         #: Training tasks and transitions of the episodes since the last :meth:`update`
         self.new: list[tuple[int, np.ndarray]] = []
@@ -88,6 +91,7 @@ class TaskBank:
         new, self.new = [episode for _, episode in self.new], []
         if missing_hook(self.task_family) is not None:
             return
+        self._n_replaceable = MAX_REPLACED
         for start in range(0, len(new), CHUNK):
             chunk = new[start : start + CHUNK]
             length = np.array([len(episode) for episode in chunk])
@@ -110,15 +114,17 @@ class TaskBank:
                 chosen.append(i)
         n_free = MAX_HINDSIGHT_TASKS - (len(self.tasks) - self.n_train)
         self._append(candidates[chosen[:n_free]])
-        for i in chosen[n_free : n_free + MAX_HINDSIGHT_TASKS]:
-            at = self.n_train + self._rng.integers(MAX_HINDSIGHT_TASKS)
-            self.tasks[at], self.best_return[at], self.length[at] = candidates[i], 0, 0
+        others = chosen[n_free : n_free + self._n_replaceable]
+        self._n_replaceable -= len(others)
+        at = self.n_train + self.likelihood[self.n_train :].argsort(kind="stable")[: len(others)]
+        self.tasks[at], self.best_return[at], self.length[at], self.likelihood[at] = candidates[others], 0, 0, np.inf
 
     def _append(self, tasks: np.ndarray) -> None:
         n = len(tasks)
         self.tasks = np.concatenate([self.tasks, tasks])
         self.best_return = np.append(self.best_return, np.zeros(n, dtype=np.float32))
         self.length = np.append(self.length, np.zeros(n, dtype=np.int64))
+        self.likelihood = np.append(self.likelihood, np.full(n, np.inf))
         self.episodes = np.concatenate([self.episodes, np.zeros((n, *self.episodes.shape[1:]), dtype=np.float32)])
 
     def _reward(self, episodes: np.ndarray, length: np.ndarray) -> None:
@@ -142,16 +148,27 @@ class TaskBank:
         """
         :return: tasks and episodes, for :meth:`load_state_dict`
         """
-        arrays = {name: th.tensor(getattr(self, name)) for name in ("tasks", "best_return", "length", "episodes")}
+        arrays = {
+            name: th.tensor(getattr(self, name)) for name in ("tasks", "best_return", "length", "likelihood", "episodes")
+        }
         return {**arrays, "random": get_generator_state(self._rng)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """
         :param state: of :meth:`state_dict`
         """
-        for name in ("tasks", "best_return", "length", "episodes"):
+        for name in ("tasks", "best_return", "length", "likelihood", "episodes"):
             setattr(self, name, state[name].cpu().numpy().copy())
         set_generator_state(self._rng, state["random"])
+
+    def rank(self, likelihood: np.ndarray) -> None:
+        """
+        Say which hindsight tasks make room for others.
+
+        :param likelihood: (n_solved,), how likely an unknown task is to be like each of the solved ones
+        """
+        self.likelihood[np.flatnonzero(self.length)] = likelihood
+        self.likelihood[: self.n_train] = np.inf
 
     @property
     def n_solved(self) -> int:

@@ -210,6 +210,28 @@ def test_an_episode_of_several_z_is_none_to_repeat(tiny_pearl: MakePEARL) -> Non
     np.testing.assert_array_equal(explorer.final_z(), z[0])
 
 
+def test_what_several_z_found_is_searched_for_until_one_z_repeats_it(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    know_tasks(model, 8)
+    adaptation = begin(model, "belief")
+
+    def episode(reward_at_the_end: float) -> set[float]:
+        places = []
+        for i in range(6):
+            adaptation.explorer.look(np.zeros((1, 2), dtype=np.float32))
+            places.append(float(adaptation.z[0, 0]))
+            adaptation.observe(step([[places[-1], 0.0]], [reward_at_the_end * (i == 5)], i == 5))
+        return set(places)
+
+    assert len(episode(9.0)) > 1, "the reward is found"
+    assert len(episode(0.0)) == 1, "what the posterior says of it fails"
+    assert len(episode(0.0)) > 1, "so the search goes on, within an episode"
+    assert len(episode(0.0)) == 1, "and every other one has a single z: the reward may come late"
+    assert len(episode(0.0)) > 1
+    assert len(episode(5.0)) == 1
+    assert [len(episode(0.0)) for _ in range(4)] == [1] * 4, "until one of these is rewarded"
+
+
 def test_the_posterior_of_a_better_episode_is_tried_once(tiny_pearl: MakePEARL) -> None:
     model = tiny_pearl()
     know_tasks(model, 3)

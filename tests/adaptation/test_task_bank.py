@@ -83,19 +83,28 @@ def test_hindsight_tasks_are_as_far_apart_as_a_task_reaches(seed: int, n_episode
     assert covered.mean() > 0.5
 
 
-def test_of_too_many_hindsight_tasks_a_random_one_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_too_many_hindsight_tasks_the_least_likely_ones_make_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A few in an update, and never a training task."""
     monkeypatch.setattr("sb3_htr.adaptation.task_bank.MAX_HINDSIGHT_TASKS", 5)
+    monkeypatch.setattr("sb3_htr.adaptation.task_bank.MAX_REPLACED", 2)
     bank = make_bank(PointRobotFamily(n_train_tasks=3))
-    seen = set()
     for i in range(10):
+        before = bank.tasks.copy()
         for episode in walks(bank, 5, i):
             bank.on_episode(0, episode)
         bank.update()
         assert len(bank.tasks) == bank.n_train + 5
-        seen |= {tuple(task) for task in bank.tasks[bank.n_train :]}
+        stayed = (bank.tasks == before).all(axis=1) if i else np.ones(8, dtype=bool)
+        assert stayed.sum() == (6 if i else 8) and stayed[: bank.n_train].all()
+        # Those furthest to the left are unlikely
+        assert (
+            i == 0
+            or before[bank.n_train :][~stayed[bank.n_train :], 0].max()
+            <= before[bank.n_train :][stayed[bank.n_train :], 0].min()
+        )
         solved = bank.solved()
         assert np.add.reduceat(solved.success, np.cumsum(solved.lengths) - solved.lengths).all(), "each is of an episode"
-    assert len(seen) > 10
+        bank.rank(bank.tasks[bank.length > 0, 0])
 
 
 def test_episodes_count_when_they_are_taken_in_and_the_bank_has_copies() -> None:

@@ -19,6 +19,8 @@ N_COMPARED = 32
 N_CHOICES = 40
 # A value below says nothing about how far a task is
 MIN_VALUE = 1e-3
+# Of what was found, what an episode with one z must return to end the search
+REPEATED = 0.5
 
 
 @dataclass
@@ -26,11 +28,12 @@ class Belief(ParticleExplorer):
     """
     The explorer that is the default at meta-test.
 
-    Before the first reward, z is that of the particle whose episode would earn most, and soonest: what the belief expects its
+    First it searches: z is that of the particle whose episode would earn most, and soonest: what the belief expects its
     rewarded steps to earn, times the critics' value of going there from here, beside what unrewarded steps return; chosen anew
-    within an episode. After it, each episode has one z, the one that promises the largest return: of a particle, under the
-    same belief; of the best episode so far, what it returned; and the encoder's posterior mean, given a new best episode, is
-    tried once.
+    within an episode. What several z found cannot be repeated: every other episode searches, until one with a single z has
+    returned half as much. The others have a single z, the one that promises the largest return: of a particle, under the same
+    belief; of the best episode so far, what it returned. The encoder's posterior mean, given a new best episode, is tried
+    once.
 
     :param margin: a particle must promise so many times what the best episode returned, to be tried in its place
     """
@@ -47,6 +50,7 @@ class Belief(ParticleExplorer):
         # Whether more than one z was acted with in the running episode
         self._turned = np.zeros(n_envs, dtype=bool)
         self._at_start = np.ones(n_envs, dtype=bool)
+        self._searching = np.ones(n_envs, dtype=bool)
         self._n_steps = np.zeros(n_envs, dtype=np.int64)
         self._every = 1
         # Of all episodes, and of those with one z
@@ -70,10 +74,12 @@ class Belief(ParticleExplorer):
         return np.where((self._best_z_return > 0)[:, None], self._best_z, self.z)
 
     def look(self, obs: np.ndarray) -> None:
-        exploring = self.exploring()
+        unsure = (self._best_z_return <= REPEATED * self._best_return) & ~self._has_proposal
+        turn = unsure & (self.exploring() | ~self._searching)
+        self._searching = np.where(self._at_start, turn, self._searching)
         due = self._at_start | (self._n_steps % self._every == 0)
-        self._search(np.flatnonzero(exploring & due), obs)
-        self._exploit(np.flatnonzero(~exploring & self._at_start))
+        self._search(np.flatnonzero(self._searching & due), obs)
+        self._exploit(np.flatnonzero(~self._searching & self._at_start))
         self._at_start[:] = False
 
     def _search(self, envs: np.ndarray, obs: np.ndarray) -> None:
