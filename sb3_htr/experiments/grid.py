@@ -103,6 +103,7 @@ class Experiment:
 
 
 POINT, SPEED, WHEELED, ANT = "SparsePointRobot-v0", "SparseTargetSpeed-v0", "SparseWheeled-v0", "SparseAnt-v0"
+FETCH = "HiddenFetchReach-v0"
 
 
 # The Point Robot's goals: as in training, nearer, and further away
@@ -170,6 +171,15 @@ ALL = (
         SPEED,
         60_000,
         tuple(map(Variant, ("htr-ser", "htr-ec", "pearl-dense", "pearl-sparse"))),
+    ),
+    Experiment(
+        "fetch_reach",
+        "An arm of gymnasium-robotics, its goal hidden: HTR, and PEARL without relabelling.",
+        FETCH,
+        150_000,
+        tuple(map(Variant, ("htr-ser", "pearl-sparse"))),
+        eval_freq=75_000,
+        evaluations=by(BELIEF),
     ),
     # RL2 learns slowly; SAC and HER are told the task, and learn fast
     Experiment(
