@@ -6,6 +6,7 @@ import inspect
 import json
 import runpy
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import matplotlib.pyplot as plt
@@ -60,6 +61,16 @@ def test_an_env_of_the_examples_whose_tasks_change_anything(module: str) -> None
     plain = {"replay_buffer_kwargs": {"relabel_probability": 0.0}, "explorer": prior, "train_explorer": prior}
     model = PEARL("MlpPolicy", env, **{**TINY, **plain, "n_tasks_per_rollout": 1}).learn(1)
     assert model.observation_space.dtype == np.float32 and model.replay_buffer is not None and model.replay_buffer.size() > 0
+
+
+def test_the_experiments_are_of_registered_envs(monkeypatch: pytest.MonkeyPatch) -> None:
+    known: dict[str, Any] = {}
+    monkeypatch.setattr("sb3_htr.experiments.grid.EXPERIMENTS", known)
+    runpy.run_module("examples.experiments")
+    assert set(known) == set(FAMILIES)
+    for experiment in known.values():
+        cells = experiment.cells()
+        assert len(cells) == 5 and cells[0].env_id in gym.registry
 
 
 def test_pictures_of_the_reacher_show_its_target() -> None:
