@@ -10,9 +10,10 @@ from sb3_htr.experiments.protocol import MIN_RUNS
 
 RESULTS = Path(__file__).parents[1] / "results"
 DOCUMENTS = (RESULTS.parent / "README.md", RESULTS.parent / "docs" / "results.md", RESULTS.parent / "docs" / "performance.md")
-# Experiments and methods in the table of README.md
-ENVS = ("point_robot", "wheeled", "ant")
+# Experiments, methods and explorers in the table of README.md
+ENVS = ("point_robot", "wheeled", "ant", "fetch_reach")
 METHODS = ("htr-ser", "pearl-dense", "pearl-sparse", "pearl-sparse-prior")
+EXPLORERS = ("belief", "prior")
 COLUMNS = {
     "last_episode_return": "return of the 20th episode",
     "success_rate": "tasks solved in it",
@@ -63,7 +64,7 @@ def headline(summaries: dict[str, dict[str, Any]]) -> str:
     for summary in (summaries[name] for name in ENVS if name in summaries):
         scores: dict[tuple[str, ...], dict[str, str]] = {}
         for row in summary["rows"]:
-            if row["variant"] in METHODS and not row.get("tested_on"):
+            if row["variant"] in METHODS and row["explorer"] in EXPLORERS and not row.get("tested_on"):
                 key = (row["env"], f"{row['env_steps']:,}", str(row["n_seeds"]), row["variant"], f"`{row['explorer']}`")
                 scores.setdefault(key, {})[row["metric"]] = _interval(row)
         lines += [[*key, *(cells[metric] for metric in COLUMNS)] for key, cells in scores.items()]
