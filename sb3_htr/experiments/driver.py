@@ -102,7 +102,7 @@ class Driver:
         :return: progress: done, running, time left. Env steps are what is counted, up to the latest checkpoints
         """
         total, now = sum(cell.n_timesteps for cell in self.cells), time.monotonic()
-        left = sum(cell.n_timesteps - self.n_steps(cell) for cell in todo)
+        left = sum(max(cell.n_timesteps - self.n_steps(cell), 0) for cell in todo)
         start, before = self._start = self._start or (now, left)
         n_running = sum(self.is_claimed(cell) for cell in todo)
         parts = [f"{len(self.cells) - len(todo) - len(self.failed)} of {len(self.cells)} cells done", f"{n_running} running"]

@@ -121,6 +121,9 @@ def test_progress_counts_cells_and_env_steps(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(time, "monotonic", lambda: now)
     with claim(running, tmp_path):
         assert driver.line(driver.todo()) == "1 of 6 cells done, 1 running, 25 % of the env steps, 0:03:00 left"
+        # The last rollout goes beyond the budget, and the evaluation is still to come
+        (running.run_folder(tmp_path) / "htr-ec/run_1/checkpoints/1200_steps").mkdir()
+        assert driver.line(driver.todo()) == "1 of 6 cells done, 1 running, 33 % of the env steps, 0:02:00 left"
 
 
 def test_a_node_that_sees_another_folder_is_found_out(trains: Any, tmp_path: Path) -> None:
