@@ -40,7 +40,7 @@ def table(summary: dict[str, Any]) -> str:
     env_steps = " / ".join(f"{n:,}" for n in sorted({row["env_steps"] for row in rows}))
     n_runs = min(row["n_seeds"] for row in rows)
     few = f", **fewer than the {MIN_RUNS} that a claim needs**" if n_runs < MIN_RUNS else ""
-    about = f"{rows[0]['env']}, {env_steps} env steps, {n_runs} runs{few}."
+    about = f"{rows[0]['env']}, {env_steps} env steps, {n_runs} run{'s' * (n_runs > 1)}{few}."
     text = "\n".join("| " + " | ".join(line) + " |" for line in (head, ["---"] * len(head), *body))
     return (
         f"{text}\n\n{about} Final models on the test tasks: IQM over runs, "
