@@ -14,6 +14,7 @@ from gymnasium import spaces
 from gymnasium.envs.mujoco.half_cheetah_v5 import HalfCheetahEnv
 
 from htr_envs import MetaEnv, TaskDistribution
+from htr_envs.headless import open_no_window
 from htr_envs.task_env import FloatArray
 
 
@@ -47,6 +48,8 @@ class HalfCheetahVelocityEnv(MetaEnv):
     def __init__(self, render_mode: str | None = None, **family_kwargs: Any) -> None:
         super().__init__(SpeedDistribution(**family_kwargs))
         self.render_mode = render_mode
+        if render_mode is not None:
+            open_no_window()
         self.cheetah = HalfCheetahEnv(render_mode=render_mode, ctrl_cost_weight=0.05)
         self.observation_space = self.cheetah.observation_space
         self.action_space = self.cheetah.action_space

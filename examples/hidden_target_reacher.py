@@ -16,6 +16,7 @@ from gymnasium.envs.mujoco.reacher_v5 import ReacherEnv
 from numpy.typing import ArrayLike
 
 from htr_envs import TaskEnv, TaskFamily, Trajectory, at_step, check_reward_type
+from htr_envs.headless import open_no_window
 from htr_envs.task_env import BoolArray, FloatArray
 
 # As in Reacher-v5: targets are drawn from a disc of this radius, in metres
@@ -74,6 +75,8 @@ class HiddenTargetReacherEnv(TaskEnv):
     def __init__(self, reward_type: str = "sparse", render_mode: str | None = None, **family_kwargs: Any) -> None:
         super().__init__(HiddenTargetFamily(**family_kwargs), reward_type)
         self.render_mode = render_mode
+        if render_mode is not None:
+            open_no_window()
         self.reacher = ReacherEnv(render_mode=render_mode)
         self.observation_space = spaces.Box(-np.inf, np.inf, (8,), np.float32)
         self.action_space = spaces.Box(-1, 1, (2,), np.float32)

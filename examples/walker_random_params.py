@@ -15,6 +15,7 @@ from gymnasium import spaces
 from gymnasium.envs.mujoco.walker2d_v5 import Walker2dEnv
 
 from htr_envs import MetaEnv, TaskDistribution
+from htr_envs.headless import open_no_window
 from htr_envs.task_env import FloatArray
 
 # Arrays of MuJoCo's model, each number of which is multiplied by BASE to the power of one number of the task
@@ -50,6 +51,8 @@ class WalkerRandomParamsEnv(MetaEnv):
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 125}  # type: ignore[misc]
 
     def __init__(self, render_mode: str | None = None, **family_kwargs: Any) -> None:
+        if render_mode is not None:
+            open_no_window()
         self.walker = Walker2dEnv(render_mode=render_mode)
         self.original = {name: getattr(self.walker.model, name).copy() for name in PARAMETERS}
         super().__init__(ScaleDistribution(sum(values.size for values in self.original.values()), **family_kwargs))
