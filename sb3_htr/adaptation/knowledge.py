@@ -90,14 +90,16 @@ class LatentKnowledge(nn.Module):
         """
         :param policy: networks as they are now
         :param means: (n, latent_dim), posterior means of recent meta-batches
-        :param bank: tasks that were solved
+        :param bank: tasks that were solved; it is told how likely they are
         :param gamma: discount
         """
         self.set_aggregate(means)
         # A loaded model's particles are kept until this training knows as many
         if bank.n_solved >= max(int(self.n_particles), 1):
             with th.no_grad():
-                self.set_particles(self._solved(policy, bank, gamma))
+                particles = self._solved(policy, bank, gamma)
+            self.set_particles(particles)
+            bank.rank(particles.log_prior.cpu().numpy())
 
     def set_aggregate(self, means: th.Tensor) -> None:
         """
@@ -148,9 +150,7 @@ class LatentKnowledge(nn.Module):
         unrewarded = beside[~success].quantile(UNREWARDED) if (~success).any() else th.zeros(())
         rewarded = beside[success].quantile(REWARDED)
         self.threshold.copy_((unrewarded + rewarded) / 2)
-        log_prior = _log_prior(z, overlap, is_train)
-        bank.rank(log_prior.cpu().numpy())
-        return Particles(z, earned / n_rewarded, share * returns[:, None], log_prior, is_train)
+        return Particles(z, earned / n_rewarded, share * returns[:, None], _log_prior(z, overlap, is_train), is_train)
 
     def set_particles(self, particles: Particles) -> None:
         """

@@ -14,12 +14,14 @@ from sb3_htr.htr.transitions import Transitions
 
 # Training tasks that are in the bank; of more, evenly spread ones. The cost of an episode is flat from there on
 MAX_TRAIN_TASKS = 128
-# Hindsight tasks. Of more, the least likely ones make room, so many in an update: newcomers are judged later
-MAX_HINDSIGHT_TASKS, MAX_REPLACED = 256, 32
+# Hindsight tasks, and how many of a full bank are newcomers, of which nobody has said yet how likely they are
+MAX_HINDSIGHT_TASKS, MAX_NEWCOMERS = 256, 32
 # Steps of each new episode that may become hindsight tasks
 N_CANDIDATES = 8
 # Episodes rewarded under all tasks at a time, to bound memory
 CHUNK = 128
+# What is saved
+ARRAYS = ("tasks", "best_return", "length", "likelihood", "episodes")
 
 
 class SolvedTasks(NamedTuple):
@@ -67,8 +69,8 @@ class TaskBank:
         self.best_return = np.zeros(self.n_train, dtype=np.float32)
         self.length = np.zeros(self.n_train, dtype=np.int64)
         self.episodes = np.zeros((self.n_train, context_size, transitions.width), dtype=np.float32)
-        # How likely an unknown task is to be like each; infinite for training tasks, and for those that were not judged yet
-        self.likelihood = np.full(self.n_train, np.inf)
+        # How likely an unknown task is to be like each hindsight task, infinite for newcomers
+        self.likelihood = np.zeros(0)
         self.seed(seed)
         #: Training tasks and transitions of the episodes since the last :meth:`update`
         self.new: list[tuple[int, np.ndarray]] = []
@@ -91,7 +93,6 @@ class TaskBank:
         new, self.new = [episode for _, episode in self.new], []
         if missing_hook(self.task_family) is not None:
             return
-        self._n_replaceable = MAX_REPLACED
         for start in range(0, len(new), CHUNK):
             chunk = new[start : start + CHUNK]
             length = np.array([len(episode) for episode in chunk])
@@ -114,10 +115,11 @@ class TaskBank:
                 chosen.append(i)
         n_free = MAX_HINDSIGHT_TASKS - (len(self.tasks) - self.n_train)
         self._append(candidates[chosen[:n_free]])
-        others = chosen[n_free : n_free + self._n_replaceable]
-        self._n_replaceable -= len(others)
-        at = self.n_train + self.likelihood[self.n_train :].argsort(kind="stable")[: len(others)]
-        self.tasks[at], self.best_return[at], self.length[at], self.likelihood[at] = candidates[others], 0, 0, np.inf
+        n_newcomers = int(np.isinf(self.likelihood).sum())
+        others = chosen[n_free : n_free + max(MAX_NEWCOMERS - n_newcomers, 0)]
+        least = self.likelihood.argsort(kind="stable")[: len(others)]
+        self.likelihood[least], at = np.inf, self.n_train + least
+        self.tasks[at], self.best_return[at], self.length[at] = candidates[others], 0, 0
 
     def _append(self, tasks: np.ndarray) -> None:
         n = len(tasks)
@@ -148,27 +150,30 @@ class TaskBank:
         """
         :return: tasks and episodes, for :meth:`load_state_dict`
         """
-        arrays = {
-            name: th.tensor(getattr(self, name)) for name in ("tasks", "best_return", "length", "likelihood", "episodes")
-        }
+        arrays = {name: th.tensor(getattr(self, name)) for name in ARRAYS}
         return {**arrays, "random": get_generator_state(self._rng)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """
         :param state: of :meth:`state_dict`
+        :raises ValueError: if another version of the package saved it
         """
-        for name in ("tasks", "best_return", "length", "likelihood", "episodes"):
+        missing = [name for name in ARRAYS if name not in state]
+        if missing:
+            raise ValueError(f"What was saved of the task bank has no {missing[0]}: load it with the version that saved it.")
+        for name in ARRAYS:
             setattr(self, name, state[name].cpu().numpy().copy())
         set_generator_state(self._rng, state["random"])
 
     def rank(self, likelihood: np.ndarray) -> None:
         """
-        Say which hindsight tasks make room for others.
+        Say which hindsight tasks make room for others: first those that nothing solves, then the least likely.
 
-        :param likelihood: (n_solved,), how likely an unknown task is to be like each of the solved ones
+        :param likelihood: (n_solved,) finite, how likely an unknown task is to be like each of the solved ones
         """
-        self.likelihood[np.flatnonzero(self.length)] = likelihood
-        self.likelihood[: self.n_train] = np.inf
+        of_all = np.full(len(self.tasks), np.finfo(np.float64).min)
+        of_all[self.length > 0] = likelihood
+        self.likelihood = of_all[self.n_train :]
 
     @property
     def n_solved(self) -> int:

@@ -84,27 +84,40 @@ def test_hindsight_tasks_are_as_far_apart_as_a_task_reaches(seed: int, n_episode
 
 
 def test_of_too_many_hindsight_tasks_the_least_likely_ones_make_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A few in an update, and never a training task."""
+    """A few until they are judged, and never a training task."""
     monkeypatch.setattr("sb3_htr.adaptation.task_bank.MAX_HINDSIGHT_TASKS", 5)
-    monkeypatch.setattr("sb3_htr.adaptation.task_bank.MAX_REPLACED", 2)
+    monkeypatch.setattr("sb3_htr.adaptation.task_bank.MAX_NEWCOMERS", 2)
     bank = make_bank(PointRobotFamily(n_train_tasks=3))
-    for i in range(10):
-        before = bank.tasks.copy()
-        for episode in walks(bank, 5, i):
+
+    def update(seed: int) -> np.ndarray:
+        """Which tasks stayed."""
+        before = bank.tasks
+        for episode in walks(bank, 5, seed):
             bank.on_episode(0, episode)
         bank.update()
-        assert len(bank.tasks) == bank.n_train + 5
-        stayed = (bank.tasks == before).all(axis=1) if i else np.ones(8, dtype=bool)
-        assert stayed.sum() == (6 if i else 8) and stayed[: bank.n_train].all()
-        # Those furthest to the left are unlikely
-        assert (
-            i == 0
-            or before[bank.n_train :][~stayed[bank.n_train :], 0].max()
-            <= before[bank.n_train :][stayed[bank.n_train :], 0].min()
-        )
         solved = bank.solved()
         assert np.add.reduceat(solved.success, np.cumsum(solved.lengths) - solved.lengths).all(), "each is of an episode"
+        return np.asarray([task in bank.tasks.tolist() for task in before.tolist()])
+
+    update(0)
+    assert len(bank.tasks) == bank.n_train + 5
+    assert update(1).all(), "all are newcomers"
+    for i in range(2, 10):
+        # Those furthest to the left are the least likely
         bank.rank(bank.tasks[bank.length > 0, 0])
+        x = bank.tasks[bank.n_train :, 0]
+        stayed = update(i)
+        assert stayed[: bank.n_train].all() and stayed.sum() == bank.n_train + 3
+        assert x[~stayed[bank.n_train :]].max() <= x[stayed[bank.n_train :]].min()
+        assert update(200 + i).all(), "two newcomers are not judged yet"
+
+
+def test_a_bank_of_another_version_is_refused_in_one_sentence() -> None:
+    bank = make_bank(PointRobotFamily(n_train_tasks=3))
+    state = bank.state_dict()
+    del state["likelihood"]
+    with pytest.raises(ValueError, match=r"has no likelihood: load it with the version that saved it\."):
+        bank.load_state_dict(state)
 
 
 def test_episodes_count_when_they_are_taken_in_and_the_bank_has_copies() -> None:

@@ -75,8 +75,8 @@ class Belief(ParticleExplorer):
 
     def look(self, obs: np.ndarray) -> None:
         unsure = (self._best_z_return <= REPEATED * self._best_return) & ~self._has_proposal
-        turn = unsure & (self.exploring() | ~self._searching)
-        self._searching = np.where(self._at_start, turn, self._searching)
+        search = unsure & (self.exploring() | ~self._searching)
+        self._searching = np.where(self._at_start, search, self._searching)
         due = self._at_start | (self._n_steps % self._every == 0)
         self._search(np.flatnonzero(self._searching & due), obs)
         self._exploit(np.flatnonzero(~self._searching & self._at_start))
