@@ -3,27 +3,30 @@
     sb3-htr experiment two_link_arm --gym-packages examples.experiments
     sb3-htr experiment hidden_target_reacher --gym-packages examples.experiments
     sb3-htr experiment sparse_half_cheetah_velocity --gym-packages examples.experiments
+    sb3-htr experiment ant_goal_disc --gym-packages examples.experiments
 
-All settings are the defaults.
+All settings are the defaults, but for the ant's entropy coefficient, which is that of SparseAnt-v0.
 """
 
-from examples import hidden_target_reacher, sparse_half_cheetah_velocity, two_link_arm  # noqa: F401 register the envs
+from examples import ant_goal_disc, hidden_target_reacher, sparse_half_cheetah_velocity, two_link_arm  # noqa: F401 register the envs
 from sb3_htr.experiments.grid import BELIEF, EXPERIMENTS, Experiment, Variant, by
 
-HTR = ("htr-ser",)
+HTR = (Variant("htr-ser"),)
+RIVALS = (*HTR, Variant("htr-hfr"), Variant("htr-hipi"))
 
-for name, env_id, n_timesteps, methods in (
+for name, env_id, n_timesteps, variants in (
     ("two_link_arm", "TwoLinkArm-v0", 200_000, HTR),
     ("hidden_target_reacher", "HiddenTargetReacher-v0", 150_000, HTR),
-    # On the family of HFR, HFR and what it was compared with
-    ("sparse_half_cheetah_velocity", "SparseHalfCheetahVelocity-v0", 1_000_000, (*HTR, "htr-hfr", "htr-hipi")),
+    # The family of HFR, with HFR and what it was compared with; and that of HyperX
+    ("sparse_half_cheetah_velocity", "SparseHalfCheetahVelocity-v0", 1_000_000, RIVALS),
+    ("ant_goal_disc", "AntGoalDisc-v0", 600_000, (Variant("htr-ser", settings={"ent_coef": 0.05}),)),
 ):
     EXPERIMENTS[name] = Experiment(
         name,
-        "An example's family, with the default settings.",
+        "An example's family.",
         env_id,
         n_timesteps,
-        tuple(map(Variant, methods)),
+        variants,
         eval_freq=n_timesteps // 4,
         evaluations=by(BELIEF),
     )

@@ -7,6 +7,7 @@ from htr_envs.dynamics import Dynamics, DynamicsEnv, DynamicsVectorEnv
 from htr_envs.goal_env import HiddenGoalEnv, HiddenGoalFamily, hide_goal
 from htr_envs.meta_env import MetaEnv, TaskDistribution
 from htr_envs.point_robot import PointRobotEnv, PointRobotFamily, PointRobotVectorEnv
+from htr_envs.position_goals import PositionGoalFamily
 from htr_envs.semicircle_goals import LocomotionFamily, SemicircleGoalFamily
 from htr_envs.target_speed import TargetSpeedEnv, TargetSpeedFamily, TargetSpeedVectorEnv
 from htr_envs.task_env import TaskEnv, TaskFamily, Trajectory, at_step, check_reward_type
@@ -23,6 +24,7 @@ __all__ = [
     "PointRobotEnv",
     "PointRobotFamily",
     "PointRobotVectorEnv",
+    "PositionGoalFamily",
     "SemicircleGoalFamily",
     "TargetSpeedEnv",
     "TargetSpeedFamily",

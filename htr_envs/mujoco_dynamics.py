@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from htr_envs.dynamics import Dynamics, DynamicsVectorEnv
 from htr_envs.headless import open_no_window
-from htr_envs.semicircle_goals import SemicircleGoalFamily
+from htr_envs.position_goals import PositionGoalFamily
 from htr_envs.task_env import BoolArray, FloatArray
 
 try:
@@ -35,7 +35,7 @@ FRAME_WIDTH, FRAME_HEIGHT = 640, 400
 CAMERA = {"lookat": np.array([0.0, 0.9, 0.0]), "distance": 4.8, "azimuth": 90.0, "elevation": -45.0}
 
 
-class MujocoDynamics(Dynamics[SemicircleGoalFamily]):
+class MujocoDynamics(Dynamics[PositionGoalFamily]):
     """Copies of a robot that is a MuJoCo model, and what an env has to know of it.
 
     A state is a row (time, qpos, qvel). The solver starts cold in every step: what it remembers of the last step would be part
@@ -122,7 +122,7 @@ class MujocoDynamics(Dynamics[SemicircleGoalFamily]):
         return self.observe(self.states), rewards, self.terminated(self.states)
 
     def render(
-        self, task_family: SemicircleGoalFamily, task: FloatArray, path: DoubleArray, render_mode: str
+        self, task_family: PositionGoalFamily, task: FloatArray, path: DoubleArray, render_mode: str
     ) -> NDArray[np.uint8] | None:
         """Draw the robot, the start and the goal, which is a disc of the goal radius.
 
@@ -232,7 +232,7 @@ class MujocoVectorEnv(DynamicsVectorEnv):
     :param kwargs: the other arguments of the single env, but for ``render_mode``.
     """
 
-    make: ClassVar[Callable[..., tuple[SemicircleGoalFamily, MujocoDynamics]]]
+    make: ClassVar[Callable[..., tuple[PositionGoalFamily, MujocoDynamics]]]
     """Of num_envs, n_threads and kwargs."""
 
     def __init__(

@@ -5,23 +5,19 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, at_step, check_reward_type, draw_task_sets
+from htr_envs.position_goals import PositionGoalFamily
+from htr_envs.task_env import FloatArray, draw_task_sets
 
 LOCOMOTION_ARENA = 20.0  # a robot gets up to 10 in 200 steps
 
 
-class SemicircleGoalFamily(TaskFamily):
+class SemicircleGoalFamily(PositionGoalFamily):
     """Goals (x, y) at one distance from the start, at angles from 0 to pi.
 
-    A step is worth 1 minus the distance to the goal within the goal radius, and 0 outside, which is the formula that the HTR
-    paper (appendix A.3) gives for the point robot.
-
     The angles of the training tasks are evenly spaced, those of validation and test tasks drawn uniformly and in balance, see
-    :func:`draw_task_sets`. Everything follows ``task_seed``, never the seed of a run. The first two numbers of an observation
-    are the position.
+    :func:`draw_task_sets`. Everything follows ``task_seed``, never the seed of a run.
 
     :param arena: goals and hindsight goals lie in the square [-arena, arena]^2.
     :param goal_distance: distance of the goals from the start at (0, 0).
@@ -48,62 +44,19 @@ class SemicircleGoalFamily(TaskFamily):
     ) -> None:
         if not 0.0 < goal_distance <= arena:
             raise ValueError(f"goal_distance is {goal_distance}, expected a number above 0 and up to {arena}.")
-        if not 0.0 < goal_radius <= 1.0:
-            raise ValueError(
-                f"goal_radius is {goal_radius}, expected above 0 and at most 1, so that a success is worth 1 - d > 0."
-            )
         self.goal_distance = float(goal_distance)
-        self.goal_radius = float(goal_radius)
         sector = None if held_out is None else (held_out[0] / 180.0, held_out[1] / 180.0)
         drawn = draw_task_sets(n_train_tasks, n_validation_tasks, n_test_tasks, task_seed, sector)
         train, validation, test = (self._goals(np.pi * values) for values in drawn)
-        super().__init__(
-            task_space=spaces.Box(-arena, arena, (2,), np.float32),
-            train_tasks=train,
-            validation_tasks=validation,
-            test_tasks=test,
-        )
+        super().__init__(arena, goal_radius, train, validation, test)
 
     def _goals(self, angles: NDArray[np.float64]) -> FloatArray:
         goals: FloatArray = (self.goal_distance * np.stack((np.cos(angles), np.sin(angles)), axis=-1)).astype(np.float32)
         return goals
 
-    def _distance(self, traj: Trajectory, task: ArrayLike) -> FloatArray:
-        goal = np.asarray(task, dtype=np.float32)[..., None, :]
-        # column by column, which is three times as fast; not np.linalg.norm: its sum may be ordered by memory layout, and
-        # rewards must be the same bits for any batch shape
-        x, y = (traj.next_observations[..., i] - goal[..., i] for i in (0, 1))
-        distance: FloatArray = np.sqrt(x * x + y * y, dtype=np.float32)
-        return distance
-
-    def _goal_reward(self, distance: FloatArray) -> FloatArray:
-        """Sparse reward at these distances to the goal, where each of them reaches it."""
-        return np.float32(1.0) - distance
-
     def sample_tasks(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw goals at uniform angles."""
         return self._goals(rng.uniform(0.0, np.pi, n))
-
-    def compute_reward(self, traj: Trajectory, task: ArrayLike, reward_type: str = "sparse") -> FloatArray:
-        """Goal reward plus task-free reward of every step.
-
-        :param reward_type: ``"sparse"``: 0 for the goal where it is not reached. ``"dense"``: minus the distance to the goal.
-        """
-        check_reward_type(reward_type)
-        distance = self._distance(traj, task)
-        if reward_type == "dense":
-            goal_reward = -distance
-        else:
-            goal_reward = np.where(distance < self.goal_radius, self._goal_reward(distance), np.float32(0.0))
-        return np.asarray(goal_reward + traj.task_free_reward, dtype=np.float32)
-
-    def is_success(self, traj: Trajectory, task: ArrayLike) -> BoolArray:
-        """Whether the next state of every step is within the goal radius."""
-        return np.asarray(self._distance(traj, task) < self.goal_radius)
-
-    def hindsight_task(self, traj: Trajectory, index: ArrayLike) -> FloatArray:
-        """The position after one step, which is the goal that this step reaches."""
-        return at_step(traj.next_observations[..., :2], index)
 
 
 class LocomotionFamily(SemicircleGoalFamily):

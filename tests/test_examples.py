@@ -22,6 +22,7 @@ FAMILIES = {
     "two_link_arm": "TwoLinkArm-v0",
     "hidden_target_reacher": "HiddenTargetReacher-v0",
     "sparse_half_cheetah_velocity": "SparseHalfCheetahVelocity-v0",
+    "ant_goal_disc": "AntGoalDisc-v0",
 }
 
 
