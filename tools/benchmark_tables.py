@@ -1,4 +1,4 @@
-"""Writes the tables of docs/performance.md from ``benchmarks/results/*.json``."""
+"""Writes the tables of docs/performance.md and docs/scaling.md from ``benchmarks/results/*.json``."""
 
 import json
 from pathlib import Path
@@ -60,7 +60,7 @@ def main() -> None:
     contents = [json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))]
     tables = {f"benchmark:{c['name']}": shares(c) if "shares" in c else table(c) for c in contents}
     tables["benchmarks"] = summary(contents)
-    fill([ROOT / "docs" / "performance.md"], tables)
+    fill([ROOT / "docs" / name for name in ("performance.md", "scaling.md")], tables)
 
 
 if __name__ == "__main__":
