@@ -108,8 +108,8 @@ FETCH = "HiddenFetchReach-v0"
 
 # The Point Robot's goals: as in training, nearer, and further away
 DISTANCES: tuple[KwArgs, ...] = ({}, {"goal_distance": 0.8}, {"goal_distance": 1.2}, {"goal_distance": 1.4})
-# Robots take long to simulate: the default and PEARL's own protocol; and the default further away
-OF_ROBOTS = (*by(("belief", "prior")), *by(BELIEF, {"goal_distance": 2.5}))
+# Robots take long to simulate: the default, PEARL's protocol with either prior; and the default further away
+OF_ROBOTS = (*by(("belief", "learned-prior", "prior")), *by(BELIEF, {"goal_distance": 2.5}))
 
 
 def replay(**settings: Any) -> dict[str, Any]:
