@@ -114,9 +114,7 @@ if __name__ == "__main__":
     from sb3_htr import PEARL, evaluate_adaptation, make_task_vec_env
 
     env = make_task_vec_env("HiddenTargetReacher-v0", n_envs=20, seed=0)
-    # Velocities are large beside positions
-    model = PEARL("MlpPolicy", env, gamma=0.95, policy_kwargs={"normalize_observations": True}, seed=0, verbose=1)
-    model.learn(150_000)
+    model = PEARL("MlpPolicy", env, seed=0, verbose=1).learn(150_000)
     returns, successes = evaluate_adaptation(model, env)
     for episode in (0, 4, 19):
         print(f"episode {episode + 1}: return {returns[:, episode].mean():.1f}, solved {successes[:, episode].mean():.0%}")
