@@ -268,8 +268,8 @@ def test_a_reward_hook_that_returns_nan_is_refused() -> None:
     buffer = filled(relabel_probability=1.0)
 
     class Broken(PointRobotFamily):
-        def _goal_reward(self, distance: Any) -> Any:
-            return distance * np.nan
+        def compute_reward(self, *args: Any, **kwargs: Any) -> Any:
+            return super().compute_reward(*args, **kwargs) * np.nan
 
     buffer.task_family = Broken()
     with pytest.raises(ValueError, match="compute_reward returned NaN or infinity"):
