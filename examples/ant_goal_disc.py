@@ -1,6 +1,6 @@
 """A sparse family of the literature: the ant must find a goal anywhere in a disc around its start.
 
-    python examples/ant_goal_disc.py                                       # meta-train and adapt, half an hour on one core
+    python examples/ant_goal_disc.py                                       # meta-train and adapt
     sb3-htr train --env AntGoalDisc-v0 --gym-packages examples.ant_goal_disc -params ent_coef:0.05
 
 Disc, goal radius, time limit and the six episodes of an adaptation are those of the sparse ant goal of HyperX (Zintgraf et
@@ -14,12 +14,10 @@ import gymnasium as gym
 import numpy as np
 
 from htr_envs import DynamicsEnv, PositionGoalFamily
-from htr_envs.ant import AntDynamics
+from htr_envs.ant import AntDynamics, AntVectorEnv
 from htr_envs.mujoco_dynamics import MujocoVectorEnv
+from htr_envs.semicircle_goals import LOCOMOTION_ARENA
 from htr_envs.task_env import FloatArray
-
-# Beyond what an ant reaches in an episode
-ARENA = 20.0
 
 
 class DiscGoalFamily(PositionGoalFamily):
@@ -34,7 +32,7 @@ class DiscGoalFamily(PositionGoalFamily):
     def __init__(self, farthest: float = 3.0, goal_radius: float = 0.75, task_seed: int = 1337) -> None:
         self.farthest = farthest
         tasks = self.sample_tasks(220, np.random.default_rng(task_seed))
-        super().__init__(ARENA, goal_radius, tasks[:100], tasks[100:120], tasks[120:])
+        super().__init__(LOCOMOTION_ARENA, goal_radius, tasks[:100], tasks[100:120], tasks[120:])
 
     def sample_tasks(self, n: int, rng: np.random.Generator) -> FloatArray:
         angle, distance = rng.uniform(0, 2 * np.pi, n), self.farthest * np.sqrt(rng.uniform(0, 1, n))
@@ -48,8 +46,8 @@ def make(num_envs: int, n_threads: int | None, /, **family_kwargs: Any) -> tuple
     :param family_kwargs: of :class:`DiscGoalFamily`
     :return: tasks, and the ants of SparseAnt-v0
     """
-    costs = {"ctrl_cost_weight": 0.005, "contact_cost_weight": 5e-4, "healthy_reward": 0.05, "reset_noise_scale": 0.01}
-    return DiscGoalFamily(**family_kwargs), AntDynamics(num_envs, n_threads, **costs)
+    _, ants = AntVectorEnv.make(num_envs, n_threads)
+    return DiscGoalFamily(**family_kwargs), ants
 
 
 class AntGoalDiscEnv(DynamicsEnv):
