@@ -1,7 +1,7 @@
 """
 Adapts the agents in trained_agents/ to all test tasks and writes the table in its README.md: ``python tools/agents_table.py``.
 
-Scores are kept in trained_agents/scores.json with the checksum of the file that they are of: only new files are adapted.
+Scores are kept in trained_agents/scores.json with the checksum of the file that they are of: only what is missing is measured.
 """
 
 import hashlib
@@ -21,6 +21,8 @@ AGENTS = Path(__file__).parents[1] / "trained_agents"
 SCORES = AGENTS / "scores.json"
 HEAD = ("file", "env steps", "explorer", "return of the 20th episode", "tasks solved in it", "episodes to the first success")
 N_EPISODES = 20
+# Beside an agent's own one: PEARL's protocol, with either prior
+EXPLORERS = ("learned-prior", "prior")
 
 
 def checksum(path: Path) -> str:
@@ -39,15 +41,20 @@ def files() -> list[Path]:
     return sorted(AGENTS.glob("*/*.zip"), key=lambda path: (order.index(path.parent.name), path.name))
 
 
-def measure(path: Path) -> dict[str, Any]:
+def measure(path: Path, known: dict[str, list[float]]) -> dict[str, list[float]]:
     """
     :param path: agent
+    :param known: scores by explorers that need not be measured again
     :return: mean scores over all test tasks, by explorer
     """
     agent = agent_at(path)
     model = agent.load()
     scores = {}
-    for explorer in dict.fromkeys((model.explorer.name, *agent.algorithm.also_explores_by)):
+    for explorer in dict.fromkeys((model.explorer.name, *EXPLORERS)):
+        if explorer in known:
+            scores[explorer] = known[explorer]
+            continue
+        print(f"Adapting {path.name} of {path.parent.name} by {explorer}")
         returns, successes, _ = record_adaptation(model, agent.make_vec_env(100), None, N_EPISODES, explorer)
         first = np.where(successes.any(axis=1), successes.argmax(axis=1) + 1, N_EPISODES + 1)
         scores[explorer] = [float(returns[:, -1].mean()), float(successes[:, -1].mean()), float(first.mean())]
@@ -86,9 +93,8 @@ def main() -> None:
     scores = read_scores()
     for path in files():
         name = str(path.relative_to(AGENTS))
-        if name not in scores:
-            print(f"Adapting {name}")
-            scores[name] = {"sha256": checksum(path), "explorers": measure(path)}
+        known = scores.get(name, {"explorers": {}})["explorers"]
+        scores[name] = {"sha256": checksum(path), "explorers": measure(path, known)}
     with atomic_path(SCORES) as temporary:
         temporary.write_text(json.dumps(scores, indent=1, sort_keys=True) + "\n")
     fill([AGENTS / "README.md"], {"agents": table(scores)})
