@@ -79,7 +79,7 @@ def table(scores: dict[str, dict[str, Any]]) -> str:
     for path in files():
         name, record = str(path.relative_to(AGENTS)), agent_at(path).record
         measured = scores.get(name, {"explorers": {}})["explorers"]
-        for explorer, (last, solved, first) in measured.items():
+        for explorer, (last, solved, first) in sorted(measured.items()):
             steps = f"{record['num_timesteps']:,}"
             lines.append(f"| `{name}` | {steps} | `{explorer}` | {last:.2f} | {solved:.0%} | {first:.1f} |")
         if not measured:
