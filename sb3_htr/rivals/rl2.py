@@ -6,6 +6,7 @@ import numpy as np
 import torch as th
 from sb3_contrib import RecurrentPPO
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -14,6 +15,7 @@ from sb3_htr.adaptation.loop import Watched
 from sb3_htr.common.checks import check_is_no_gymnasium_vector_env, check_numbers
 from sb3_htr.common.vec_env import in_float32, make_task_vec_env
 from sb3_htr.rivals.base import Rival, RivalAdaptation
+from sb3_htr.rivals.trial_policy import TrialLstmPolicy
 from sb3_htr.rivals.trials import LastStep, TrialVecEnv
 
 N_EPISODES_PER_TRIAL = 5
@@ -84,6 +86,7 @@ class RL2(Rival, RecurrentPPO):
 
     DEFAULT_POLICY: ClassVar[str] = "MlpLstmPolicy"
     ACTS_BY: ClassVar[tuple[str, ...]] = ("n_episodes_per_trial",)
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpLstmPolicy": TrialLstmPolicy}
     policy: RecurrentActorCriticPolicy
     env: TrialVecEnv | None
 

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from helpers import ENV_ID
@@ -13,6 +14,7 @@ from sb3_htr import evaluate_adaptation
 from sb3_htr.adaptation.adaptation import Step
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.rivals.rl2 import RL2, TrialAdaptation
+from sb3_htr.rivals.trial_policy import TrialLstmPolicy
 from sb3_htr.rivals.trials import TrialVecEnv
 
 N_STEPS = 20
@@ -140,3 +142,26 @@ def test_tasks_may_change_anything() -> None:
     model = tiny_rl2(DummyVecEnv([make_cart, make_cart]), n_episodes_per_trial=3).learn(120)
     returns, _ = evaluate_adaptation(model, DummyVecEnv([make_cart]), n_episodes=4)
     assert returns.shape == (1, 4) and np.isfinite(returns).all()
+
+
+def test_a_trial_is_one_call_of_the_lstm_and_the_library_would_learn_the_same() -> None:
+    model = tiny_rl2(n_trials_per_rollout=2)
+    model.learn(160)
+    data: Any = next(model.rollout_buffer.get(100))  # of 160 steps: sequences begin within trials, too
+    assert data.episode_starts.any()
+    calls: list[Any] = []
+    for lstm in (model.policy.lstm_actor, model.policy.lstm_critic):
+        assert lstm is not None
+        lstm.register_forward_hook(lambda *_: calls.append(1))
+    by_library = RecurrentActorCriticPolicy.evaluate_actions
+    gradients = []
+    for of in (TrialLstmPolicy, RecurrentActorCriticPolicy):
+        model.policy.__class__ = of
+        model.policy.zero_grad()
+        calls.clear()
+        values, log_prob, _ = by_library(model.policy, data.observations, data.actions, data.lstm_states, data.episode_starts)
+        (values.flatten() + log_prob)[data.mask > 0].sum().backward()
+        gradients.append([th.as_tensor(parameter.grad).clone() for parameter in model.policy.parameters()])
+        assert len(calls) == 2 if of is TrialLstmPolicy else len(calls) > 2
+    for ours, theirs in zip(*gradients, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-5)
