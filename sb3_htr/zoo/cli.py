@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 
 import gymnasium
+import torch as th
 
 from sb3_htr.common.versions import versions
 
@@ -89,6 +90,9 @@ def console() -> int:
     """
     # Modules of one's own beside what one works on, as `python -m` has it
     sys.path.append(os.getcwd())
+    # Products are small: beside another process, an evaluation on two threads takes three times as long as on one
+    if "OMP_NUM_THREADS" not in os.environ:
+        th.set_num_threads(1)
     try:
         return main()
     except BrokenPipeError:
