@@ -181,7 +181,7 @@ ALL = (
         eval_freq=75_000,
         evaluations=by(BELIEF),
     ),
-    # RL2 learns slowly; SAC and HER are told the task, and learn fast
+    # RL2 learns slowly; SAC and HER are told the task, and learn fast. Further away there is no training task to relabel under
     Experiment(
         "rivals",
         "HTR against other ways to relabel and to adapt, and against agents that are told more.",
@@ -193,7 +193,7 @@ ALL = (
             Variant("sac-her", budget=2 / 15),
             Variant("pearl-dense", budget=3),
         ),
-        evaluations=by(("belief", "prior")),
+        evaluations=(*by(("belief", "prior")), *by(BELIEF, {"goal_distance": 1.4})),
     ),
     # HTR paper, figure 11. Steps of an episode for each distance: time to get there, and as long again. The budget is that of
     # episodes of 20 steps; longer ones have as many episodes and updates
