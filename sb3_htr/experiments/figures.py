@@ -64,6 +64,29 @@ def learning(results: Results, path: Path) -> None:
     finish(figure, path, f"{next(iter(results)).env_id}: IQM over {n_seeds(results)} seeds, 95 % interval")
 
 
+def race(results: Results, path: Path) -> None:
+    """
+    Validation tasks solved during meta-training, over env steps and over the minutes that these and the updates took.
+
+    :param results: raw results of the cells
+    :param path: picture to write
+    """
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained", sharey=True)
+    groups = by_variant(results)
+    for (colour, _), (variant, runs) in zip(curve_styles([*groups]), groups.items(), strict=True):
+        solved = np.stack([100 * raw["solved"].mean(axis=1) for _, raw in runs])
+        label = variant if len(runs) == n_seeds(results) else f"{variant} ({len(runs)} seeds)"
+        band(left, runs[0][1]["timesteps"] / 1000, solved, colour, "-", label)
+        band(right, np.mean([raw["elapsed_s"] for _, raw in runs], axis=0) / 60, solved, colour, "-", label)
+    for axes in (left, right):
+        axes.set_xscale("log")
+        axes.xaxis.set_major_formatter("{x:g}")
+    left.set_xlabel("thousand env steps of meta-training")
+    right.set_xlabel("minutes of meta-training, with evaluations")
+    left.set_ylabel("validation tasks solved in the last adaptation episode (%)")
+    finish(figure, path, f"{next(iter(results)).env_id}: IQM over {n_seeds(results)} seeds, 95 % interval")
+
+
 def optimal_return(goal_distance: float, max_episode_steps: int) -> float:
     """
     :param goal_distance: argument of SparsePointRobot-v0

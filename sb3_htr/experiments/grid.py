@@ -194,6 +194,7 @@ ALL = (
             Variant("pearl-dense", budget=3),
         ),
         evaluations=(*by(("belief", "prior")), *by(BELIEF, {"goal_distance": 1.4})),
+        figure=figures.race,
     ),
     # HTR paper, figure 11. Steps of an episode for each distance: time to get there, and as long again. The budget is that of
     # episodes of 20 steps; longer ones have as many episodes and updates

@@ -17,6 +17,8 @@ from sb3_htr.zoo.run.algorithm import Model
 EVAL_SEEDS = (1, 2, 3, 4, 5)
 # A table of fewer says so
 MIN_RUNS = 5
+# Of the validation tasks, when a family counts as learned
+SOLVED_SHARE = 0.8
 
 Raw = Mapping[str, np.ndarray]
 
@@ -62,9 +64,14 @@ def loss_of_stability(raw: Raw, evaluation: str) -> np.ndarray:
     return np.atleast_2d(means.max() - means[-3:].min())
 
 
-METRICS: dict[str, Callable[[Raw, str], np.ndarray]] = {
-    metric.__name__: metric for metric in (last_episode_return, success_rate, episodes_to_first_success, loss_of_stability)
-}
+def env_steps_to_solved(raw: Raw, evaluation: str) -> np.ndarray:
+    """(1, 1), env steps of the first evaluation with enough validation tasks solved; of one more than were made if never."""
+    steps, enough = raw["timesteps"], raw["solved"].mean(axis=1) >= SOLVED_SHARE
+    return np.atleast_2d(float(steps[enough.argmax()] if enough.any() else steps[-1] * (len(steps) + 1) / len(steps)))
+
+
+_ALL = (last_episode_return, success_rate, episodes_to_first_success, loss_of_stability, env_steps_to_solved)
+METRICS: dict[str, Callable[[Raw, str], np.ndarray]] = {metric.__name__: metric for metric in _ALL}
 
 
 def scores(raws: list[Any], metric: str, evaluation: str) -> np.ndarray:

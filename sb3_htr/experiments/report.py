@@ -19,6 +19,7 @@ from sb3_htr.experiments.runner import LOGGED
 from sb3_htr.zoo.plots.intervals import iqm_difference, iqm_interval
 
 RETURN = "last_episode_return"
+STEPS = "env_steps_to_solved"
 
 
 class Runs(NamedTuple):
@@ -50,7 +51,8 @@ class Runs(NamedTuple):
 
     def means(self) -> dict[str, float | None]:
         """Over all runs; None where an algorithm does not tell."""
-        means = {key: float(np.mean([raw[key] for raw in self.raws])) for key in (*LOGGED, "wall_s")}
+        means = {key: float(np.mean([raw[key] for raw in self.raws])) for key in LOGGED}
+        means["wall_s"] = float(np.mean([raw["elapsed_s"][-1] for raw in self.raws]))
         means["calibration_error"] = expected_calibration_error(np.sum([raw["calibration"] for raw in self.raws], axis=0))
         return {key: None if np.isnan(mean) else round(mean, 4) for key, mean in means.items()}
 
@@ -77,6 +79,7 @@ def summarize(command: str, results: dict[Cell, Path]) -> dict[str, Any]:
         "n_eval_seeds": len(EVAL_SEEDS),
         "rows": [row for runs in all_runs for row in _rows(runs)],
         "differences": [row for first, *others in compared for other in others for row in _differences(first, other)],
+        "slowdowns": [_slowdown(first, other) for first, *others in compared for other in others],
         "explorer_differences": [row for runs in all_runs for row in _explorer_differences(runs)],
     }
 
@@ -96,6 +99,14 @@ def _differences(first: Runs, other: Runs) -> Iterator[dict[str, Any]]:
         own = evaluation if evaluation in there else there[0]
         interval = _rounded(iqm_difference(first.returns(own), other.returns(evaluation)))
         yield {**other.about(evaluation), "of": first.cells[0].variant, "metric": RETURN, **interval}
+
+
+def _slowdown(first: Runs, other: Runs) -> dict[str, Any]:
+    """How many times the env steps of the first variant the other needs to solve enough of the validation tasks."""
+    steps = [np.log(scores(runs.raws, STEPS, runs.evaluations[0].name)) for runs in (other, first)]
+    estimate, low, high = np.exp(iqm_difference(*steps))
+    about = other.about(other.evaluations[0])
+    return {**about, "of": first.cells[0].variant, "metric": STEPS, **_rounded((estimate, low, high))}
 
 
 def _explorer_differences(runs: Runs) -> Iterator[dict[str, Any]]:

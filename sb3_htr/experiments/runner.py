@@ -18,6 +18,7 @@ from sb3_htr.experiments.protocol import evaluate
 from sb3_htr.zoo.commands import train
 from sb3_htr.zoo.run.agents import RECORD, agent_at, file_stem, find_runs, read_record
 from sb3_htr.zoo.run.algorithm import Model
+from sb3_htr.zoo.run.solved import seconds_at
 from sb3_htr.zoo.run.trust import import_packages
 
 # Means over the training of what HTR paper, B.2 reasons with
@@ -37,9 +38,10 @@ def run_cell(cell: Cell, runs: Path) -> bool:
     """
     Train, unless there is a finished run, then evaluate the final model.
 
-    The result is an npz with ``timesteps``, ``curve`` (n, n_tasks) on validation tasks; what
-    :func:`sb3_htr.experiments.protocol.evaluate` tells of the final model; the means of what is in ``LOGGED``; ``wall_s`` of
-    the training and ``commit`` of the code that trained. What would be printed is in the ``log.txt`` of its folder.
+    The result is an npz with ``timesteps`` and ``elapsed_s``, (n,); ``curve`` and ``solved``, (n, n_tasks), return of the last
+    adaptation episode on the validation tasks and whether it solved them; what
+    :func:`sb3_htr.experiments.protocol.evaluate` tells of the final model; the means of what is in ``LOGGED``; and ``commit``
+    of the code that trained. What would be printed is in the ``log.txt`` of its folder.
 
     :param cell: what to run
     :param runs: folder of all experiments' runs; a cell that has a result there is not run again
@@ -83,7 +85,8 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
         **{key: np.nanmean(progress[f"train/{key}"]) if f"train/{key}" in logged else np.nan for key in LOGGED},
         "timesteps": evaluations["timesteps"],
         "curve": evaluations["results"],
-        "wall_s": _wall_time(progress["time/time_elapsed"]),
+        "solved": evaluations["successes"][..., -1],
+        "elapsed_s": seconds_at(run / "progress.csv", evaluations["timesteps"]),
         "commit": _commit_of(run),
         **evaluate(cell, model),
     }
@@ -132,12 +135,6 @@ def _logged(file: Path) -> Iterator[None]:
         except Exception:
             traceback.print_exc()
             raise
-
-
-def _wall_time(elapsed: np.ndarray) -> float:
-    """Seconds, from those since the training began or went on (n,)."""
-    elapsed = elapsed[~np.isnan(elapsed)]
-    return float(elapsed[np.append(np.diff(elapsed) < 0, True)].sum())
 
 
 def _commit_of(run: Path) -> str:

@@ -23,7 +23,8 @@ def made_up(cells: list[Cell], folder: Path) -> dict[Cell, Path]:
         arrays: dict[str, Any] = {
             "timesteps": np.arange(1, 5) * 1000,
             "curve": np.ones((4, 20)) * [[1], [5], [4], [4.5]],
-            "wall_s": 1.0,
+            "solved": np.arange(20) < np.array([[0], [15], [16], [20]]),
+            "elapsed_s": np.arange(1.0, 5.0),
         }
         arrays |= {"commit": "abc", **{key: 0.5 for key in LOGGED}}
         arrays["calibration"] = np.tile([[4.0, 1.0, 2.0]], (10, 1))
@@ -49,6 +50,7 @@ def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monk
     assert all((raw[f"{cell.name}/returns_{cell.evaluations[0].name}"] == cell.seed).all() for cell in cells)
     summary = json.loads((folder / "summary.json").read_text())
     value = {"last_episode_return": 2.0, "success_rate": 1.0, "episodes_to_first_success": 3.0, "loss_of_stability": 1.0}
+    value["env_steps_to_solved"] = 3000.0
     variants = {(cell.variant, str(cell.env_kwargs)): cell for cell in cells}
     for row in summary["rows"]:
         cell = variants[row["variant"], str(row["env_kwargs"])]
@@ -63,6 +65,9 @@ def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monk
     of_first = {env_kwargs: len(cell.evaluations) for (_, env_kwargs), cell in reversed(variants.items())}
     assert len(summary["differences"]) == n_tests - sum(of_first.values())
     assert all(difference["low"] <= 0 <= difference["high"] for difference in summary["differences"])
+    assert len(summary["slowdowns"]) == len(variants) - len(of_first)
+    assert all(slowdown["low"] == slowdown["iqm"] == slowdown["high"] == 1 for slowdown in summary["slowdowns"])
+    assert {row["wall_s"] for row in summary["rows"]} == {4.0}
     for difference in summary["explorer_differences"]:
         assert difference["explorer"] != difference["of"] and difference["low"] == difference["iqm"] == difference["high"] == 0
     n_places = len({str(evaluation.tested_on) for evaluation in experiment.evaluations})
@@ -120,7 +125,9 @@ def test_the_grid_is_what_it_says(experiment: Any) -> None:
 
 def test_metrics() -> None:
     raw = {
+        "timesteps": np.arange(1, 6) * 100,
         "curve": np.array([[1.0], [9], [8], [5], [7]]),
+        "solved": np.array([[0], [0], [1], [0], [1]]),
         "returns_a": np.arange(6.0).reshape(1, 2, 3),
         "successes_a": np.array([[[False, True, True], [False, False, False]]]),
     }
@@ -130,6 +137,7 @@ def test_metrics() -> None:
         "success_rate": [[1, 0]],
         "episodes_to_first_success": [[2, 4]],
         "loss_of_stability": [[4]],
+        "env_steps_to_solved": [[300]],
     }
 
 
@@ -144,3 +152,15 @@ def test_tables_are_filled_in_between_their_marks_alone(tmp_path: Path) -> None:
     for _ in range(2):
         tables.fill([page], {"one": "new\n", "two": "2\n", "three": "3\n"})
         assert page.read_text() == ("before\n<!-- one -->\nnew\n<!-- end -->\nbetween\n<!-- two -->\n2\n<!-- end -->\n")
+
+
+def test_a_slow_learner_needs_times_the_env_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 50)
+    results = made_up(EXPERIMENTS["held_out_sector"].cells(2), tmp_path)
+    for solved, factor in (([0, 20, 20, 20], 2 / 3), ([0, 0, 0, 15], 5 / 3)):
+        for cell, path in results.items():
+            if cell.method == "pearl-dense":
+                np.savez(path, **{**np.load(path), "solved": np.arange(20) < np.array(solved)[:, None]})
+        (slowdown,) = report.summarize("", results)["slowdowns"]
+        assert slowdown["method"] == "pearl-dense" and slowdown["of"] == "htr-ser"
+        assert slowdown["iqm"] == pytest.approx(factor, abs=1e-3), "never counts as one evaluation more than there were"

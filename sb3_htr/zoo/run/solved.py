@@ -21,15 +21,26 @@ def time_to_solved(run: Path) -> tuple[int, float] | None:
     with np.load(run / "evaluations.npz") as evaluations:
         steps, returns = evaluations["timesteps"], evaluations["returns"][:, :, -1].mean(axis=1)
     is_solved = returns >= returns.min() + SOLVED * (returns[-1] - returns.min())
-    first = int(steps[is_solved.argmax()])
-    return first, _seconds_at(run / "progress.csv", first)
+    first = steps[is_solved.argmax()]
+    return int(first), float(seconds_at(run / "progress.csv", np.array([first]))[0])
 
 
-def _seconds_at(log: Path, step: int) -> float:
-    """When an env step was reached: between the rollouts that were logged around it."""
+def seconds_at(log: Path, steps: np.ndarray) -> np.ndarray:
+    """
+    :param log: ``progress.csv`` of a training
+    :param steps: (n,) env steps
+    :return: (n,) seconds of training until then, between the rollouts that were logged around it. A training that went on from
+        a checkpoint counts from 0 again, which is put right. NaN where nothing tells them
+    """
     if not log.exists():
-        return float("nan")
+        return np.full(len(steps), np.nan)
     with log.open(newline="") as file:
         rows = [(row.get("time/total_timesteps"), row.get("time/time_elapsed")) for row in csv.DictReader(file)]
-    logged = np.array([(float(steps), float(seconds)) for steps, seconds in rows if steps and seconds])
-    return float(np.interp(step, logged[:, 0], logged[:, 1])) if len(logged) else float("nan")
+    logged = np.array([(float(step), float(second)) for step, second in rows if step and second])
+    if len(logged) == 0:
+        return np.full(len(steps), np.nan)
+    seconds = logged[:, 1]
+    again = np.append(False, np.diff(seconds) < 0)
+    before = np.cumsum(np.where(again, np.append(0.0, seconds[:-1]), 0.0))
+    # Rollouts after the checkpoint that it went on from are logged twice, and count as often as they were made
+    return np.asarray(np.interp(steps, np.maximum.accumulate(logged[:, 0]), seconds + before))
