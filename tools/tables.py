@@ -41,11 +41,13 @@ def table(summary: dict[str, Any]) -> str:
     n_runs = min(row["n_seeds"] for row in rows)
     few = f", **fewer than the {MIN_RUNS} that a claim needs**" if n_runs < MIN_RUNS else ""
     about = f"{rows[0]['env']}, {env_steps} env steps, {n_runs} run{'s' * (n_runs > 1)}{few}."
+    later = summary.get("evaluation_commit", summary["commit"])
+    commits = summary["commit"] if later == summary["commit"] else f"{summary['commit']}, evaluated by {later}"
     text = "\n".join("| " + " | ".join(line) + " |" for line in (head, ["---"] * len(head), *body))
     return (
         f"{text}\n\n{about} Final models on the test tasks: IQM over runs, "
         f"95 % bootstrap interval over runs, tasks and {summary.get('n_eval_seeds', 1)} evaluation seeds. "
-        f"`{summary['command']}`, commit {summary['commit']}, {summary['machine']}.\n"
+        f"`{summary['command']}`, commit {commits}, {summary['machine']}.\n"
     )
 
 

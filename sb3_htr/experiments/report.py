@@ -20,6 +20,8 @@ from sb3_htr.zoo.plots.intervals import iqm_difference, iqm_interval
 
 RETURN = "last_episode_return"
 STEPS = "env_steps_to_solved"
+# Of the code that trained, and of that which evaluated
+COMMITS = ("commit", "evaluation_commit")
 
 
 class Runs(NamedTuple):
@@ -73,7 +75,7 @@ def summarize(command: str, results: dict[Cell, Path]) -> dict[str, Any]:
     return {
         "name": next(iter(results)).experiment,
         "command": command,
-        "commit": ", ".join(sorted({str(raw["commit"]) for runs in all_runs for raw in runs.raws})),
+        **{key: ", ".join(sorted({str(raw[key]) for runs in all_runs for raw in runs.raws})) for key in COMMITS},
         "date": date.today().isoformat(),
         "machine": f"{_processor()}, one thread per run, Python {platform.python_version()}",
         "n_eval_seeds": len(EVAL_SEEDS),

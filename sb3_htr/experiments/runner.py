@@ -1,7 +1,7 @@
 """One cell, in whatever process an executor calls it: claimed, trained from where it was, and evaluated."""
 
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from itertools import takewhile
 from pathlib import Path
@@ -13,6 +13,7 @@ from filelock import FileLock, Timeout
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.resume import checkpoints
+from sb3_htr.common.versions import commit
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.protocol import evaluate
 from sb3_htr.zoo.commands import train
@@ -40,8 +41,8 @@ def run_cell(cell: Cell, runs: Path) -> bool:
 
     The result is an npz with ``timesteps`` and ``elapsed_s``, (n,); ``curve`` and ``solved``, (n, n_tasks), return of the last
     adaptation episode on the validation tasks and whether it solved them; what
-    :func:`sb3_htr.experiments.protocol.evaluate` tells of the final model; the means of what is in ``LOGGED``; and ``commit``
-    of the code that trained. What would be printed is in the ``log.txt`` of its folder.
+    :func:`sb3_htr.experiments.protocol.evaluate` tells of the final model; the means of what is in ``LOGGED``; ``commit`` of
+    the code that trained, and ``evaluation_commit``. What would be printed is in the ``log.txt`` of its folder.
 
     :param cell: what to run
     :param runs: folder of all experiments' runs; a cell that has a result there is not run again
@@ -87,7 +88,9 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
         "curve": evaluations["results"],
         "solved": evaluations["successes"][..., -1],
         "elapsed_s": seconds_at(run / "progress.csv", evaluations["timesteps"]),
-        "commit": _commit_of(run),
+        # Of the code as it was when the training began, and as it is now
+        "commit": _named(read_record(run / RECORD)),
+        "evaluation_commit": _named(commit()),
         **evaluate(cell, model),
     }
 
@@ -137,7 +140,6 @@ def _logged(file: Path) -> Iterator[None]:
             raise
 
 
-def _commit_of(run: Path) -> str:
-    """Of the code that trained, as it was when the training began."""
-    record = read_record(run / RECORD)
-    return f"{record.get('commit', 'unknown')}{'' if record.get('clean', True) else ' with changes'}"
+def _named(code: Mapping[str, Any]) -> str:
+    """The commit of some code, and whether it was changed."""
+    return f"{code.get('commit', 'unknown')}{'' if code.get('clean', True) else ' with changes'}"

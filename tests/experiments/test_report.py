@@ -26,7 +26,7 @@ def made_up(cells: list[Cell], folder: Path) -> dict[Cell, Path]:
             "solved": np.arange(20) < np.array([[0], [15], [16], [20]]),
             "elapsed_s": np.arange(1.0, 5.0),
         }
-        arrays |= {"commit": "abc", **{key: 0.5 for key in LOGGED}}
+        arrays |= {"commit": "abc", "evaluation_commit": "abc", **{key: 0.5 for key in LOGGED}}
         arrays["calibration"] = np.tile([[4.0, 1.0, 2.0]], (10, 1))
         for evaluation in cell.evaluations:
             returns = float(cell.seed + len(evaluation.tested_on))
@@ -80,7 +80,8 @@ def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monk
         here = sum(evaluation.tested_on == place for cell in variants.values() for evaluation in cell.evaluations)
         label = f"| goal distance {place['goal_distance']} |" if place else "| as in training |"
         assert table.count(label) == here * (n_places > 1)
-    assert f"`sb3-htr experiment {name}`, commit abc" in table
+    assert f"`sb3-htr experiment {name}`, commit abc, " in table
+    assert "commit abc, evaluated by def, " in tables.table({**summary, "evaluation_commit": "def"})
     headline = tables.headline({name: summary})
     shown = [cell for cell in variants.values() if cell.variant in tables.METHODS] if name in tables.ENVS else []
     rows = [
