@@ -38,9 +38,7 @@ def table(summary: dict[str, Any]) -> str:
     head = [*settings, "method", "explorer", *["tested on"] * has_places, *COLUMNS.values()]
     body = [[*key, *(cells[metric] for metric in COLUMNS)] for key, cells in lines.items()]
     env_steps = " / ".join(f"{n:,}" for n in sorted({row["env_steps"] for row in rows}))
-    n_runs = min(row["n_seeds"] for row in rows)
-    few = f", **fewer than the {MIN_RUNS} that a claim needs**" if n_runs < MIN_RUNS else ""
-    about = f"{rows[0]['env']}, {env_steps} env steps, {n_runs} run{'s' * (n_runs > 1)}{few}."
+    about = f"{rows[0]['env']}, {env_steps} env steps, {_runs(rows)}."
     later = summary.get("evaluation_commit", summary["commit"])
     commits = summary["commit"] if later == summary["commit"] else f"{summary['commit']}, evaluated by {later}"
     text = "\n".join("| " + " | ".join(line) + " |" for line in (head, ["---"] * len(head), *body))
@@ -49,6 +47,17 @@ def table(summary: dict[str, Any]) -> str:
         f"95 % bootstrap interval over runs, tasks and {summary.get('n_eval_seeds', 1)} evaluation seeds. "
         f"`{summary['command']}`, commit {commits}, {summary['machine']}.\n"
     )
+
+
+def _runs(rows: list[dict[str, Any]]) -> str:
+    """How many there are, of which methods, and whether these are enough."""
+    n_runs = {row["variant"]: row["n_seeds"] for row in rows}
+    texts = []
+    for n in sorted({*n_runs.values()}, reverse=True):
+        few = f", **fewer than the {MIN_RUNS} that a claim needs**" if n < MIN_RUNS else ""
+        of = ", ".join(variant for variant, m in n_runs.items() if m == n)
+        texts.append(f"{n} run{'s' * (n > 1)}{f' of {of}' if len({*n_runs.values()}) > 1 else ''}{few}")
+    return "; ".join(texts)
 
 
 def _place(row: dict[str, Any]) -> str:

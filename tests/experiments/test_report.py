@@ -81,6 +81,10 @@ def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monk
         label = f"| goal distance {place['goal_distance']} |" if place else "| as in training |"
         assert table.count(label) == here * (n_places > 1)
     assert f"`sb3-htr experiment {name}`, commit abc, " in table
+    uneven = [{**row, "n_seeds": 5 if row["variant"] == cells[0].variant else 1} for row in summary["rows"]]
+    if len({cell.variant for cell in cells}) > 1:
+        few = tables.table({**summary, "rows": uneven})
+        assert f"5 runs of {cells[0].variant}; 1 run of {cells[1].variant}" in few and few.count("fewer than the 5") == 1
     assert "commit abc, evaluated by def, " in tables.table({**summary, "evaluation_commit": "def"})
     headline = tables.headline({name: summary})
     shown = [cell for cell in variants.values() if cell.variant in tables.METHODS] if name in tables.ENVS else []
