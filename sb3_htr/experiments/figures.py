@@ -75,7 +75,7 @@ def race(results: Results, path: Path) -> None:
     groups = by_variant(results)
     for (colour, _), (variant, runs) in zip(curve_styles([*groups]), groups.items(), strict=True):
         solved = np.stack([100 * raw["solved"].mean(axis=1) for _, raw in runs])
-        label = variant if len(runs) == n_seeds(results) else f"{variant} ({len(runs)} seeds)"
+        label = variant if len(runs) == n_seeds(results) else f"{variant} (seeds: {len(runs)})"
         band(left, runs[0][1]["timesteps"] / 1000, solved, colour, "-", label)
         band(right, np.mean([raw["elapsed_s"] for _, raw in runs], axis=0) / 60, solved, colour, "-", label)
     for axes in (left, right):
@@ -83,7 +83,7 @@ def race(results: Results, path: Path) -> None:
         axes.xaxis.set_major_formatter("{x:g}")
     left.set_xlabel("thousand env steps of meta-training")
     right.set_xlabel("minutes of meta-training, with evaluations")
-    left.set_ylabel("validation tasks solved in the last adaptation episode (%)")
+    left.set_ylabel("validation tasks solved in the last episode (%)")
     finish(figure, path, f"{next(iter(results)).env_id}: IQM over {n_seeds(results)} seeds, 95 % interval")
 
 
