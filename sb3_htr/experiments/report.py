@@ -104,7 +104,7 @@ def _differences(first: Runs, other: Runs) -> Iterator[dict[str, Any]]:
 
 
 def _slowdown(first: Runs, other: Runs) -> dict[str, Any]:
-    """How many times the env steps of the first variant the other needs to solve enough of the validation tasks."""
+    """How many times the env steps of the first variant the other needs to solve enough of the validation tasks, or more."""
     steps = [np.log(scores(runs.raws, STEPS, runs.evaluations[0].name)) for runs in (other, first)]
     estimate, low, high = np.exp(iqm_difference(*steps))
     about = other.about(other.evaluations[0])
