@@ -18,6 +18,7 @@ import htr_envs  # noqa: F401 registers the envs
 from sb3_htr import PEARL
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.common.versions import commit, named
 from sb3_htr.zoo.run.memory import keep_freed_memory
 
 # As sb3-htr train does
@@ -25,6 +26,8 @@ keep_freed_memory()
 
 ENV_ID = "SparsePointRobot-v0"
 RESULTS = Path(__file__).parent / "results"
+# What figures depend on, as git names it: not the figures themselves
+CODE = (":/sb3_htr", ":/htr_envs", ":(top,glob)benchmarks/*.py")
 # HTR paper, A.2, and PEARL's reference implementation
 PAPER_SIZES: dict[str, Any] = {
     "meta_batch_size": 16,
@@ -117,17 +120,25 @@ def write(name: str, figures: list[Figure]) -> None:
     :param name: of the benchmark
     :param figures: go to ``benchmarks/results/<name>.json``, and to the standard output
     """
-    content = {
+    write_content(name, {"rows": [asdict(figure) for figure in figures]})
+
+
+def write_content(name: str, content: dict[str, Any]) -> None:
+    """
+    :param name: of the benchmark
+    :param content: goes there with what it was measured with
+    """
+    origin = {
         "name": name,
         "command": " ".join(["python", f"benchmarks/{name}.py", *sys.argv[1:]]),
         "date": date.today().isoformat(),
+        "commit": named(commit(*CODE)),
         "machine": machine(),
-        "rows": [asdict(figure) for figure in figures],
     }
     RESULTS.mkdir(exist_ok=True)
     with atomic_path(RESULTS / f"{name}.json") as path:
-        path.write_text(json.dumps(content, indent=1) + "\n")
-    print(json.dumps(content["rows"], indent=1))
+        path.write_text(json.dumps({**origin, **content}, indent=1) + "\n")
+    print(json.dumps(content, indent=1))
 
 
 def machine() -> str:

@@ -1,16 +1,14 @@
 """Where the time of a training goes: the fast profile on SparsePointRobot-v0, one thread."""
 
-import json
 from collections import defaultdict
 from collections.abc import Callable
 from typing import Any
 
 import torch as th
-from _common import ENV_ID, RESULTS, machine
+from _common import ENV_ID, write_content
 from torch.profiler import ProfilerActivity, profile, record_function
 
 from sb3_htr import PEARL
-from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.vec_env import make_task_vec_env
 
 PRODUCTS = {"aten::mm", "aten::addmm", "mkldnn::_linear_pointwise"}
@@ -64,16 +62,7 @@ def main() -> None:
         shares[name] += event.self_cpu_time_total
     total = sum(shares.values())
     rows = sorted(((round(share / total, 4), name) for name, share in shares.items()), reverse=True)
-    content = {
-        "name": "profile_training",
-        "command": "python benchmarks/profile_training.py",
-        "machine": machine(),
-        "shares": [{"name": name, "share": share} for share, name in rows if share >= 0.01],
-    }
-    RESULTS.mkdir(exist_ok=True)
-    with atomic_path(RESULTS / "profile_training.json") as path:
-        path.write_text(json.dumps(content, indent=1) + "\n")
-    print(json.dumps(content["shares"], indent=1))
+    write_content("profile_training", {"shares": [{"name": name, "share": share} for share, name in rows if share >= 0.01]})
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ def table(content: dict[str, Any]) -> str:
         ours, reference = (f"{row[key]:,.{_decimals(row[key])}f}" if row[key] else "" for key in ("ours", "reference"))
         lines.append([row["name"], f"{ours} {row['unit']}", reference, ratio, goal, row["against"]])
     text = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-    return f"{text}\n\n`{content['command']}`, {content['date']}, {content['machine']}.\n"
+    return f"{text}\n\n{_origin(content)}\n"
 
 
 def summary(contents: list[dict[str, Any]]) -> str:
@@ -48,7 +48,11 @@ def shares(content: dict[str, Any]) -> str:
     """
     lines = ["| part | share of wall time |", "| --- | --- |"]
     lines += [f"| {row['name'].removeprefix('aten::')} | {row['share']:.1%} |" for row in content["shares"]]
-    return "\n".join(lines) + f"\n\n`{content['command']}`, {content['machine']}.\n"
+    return "\n".join(lines) + f"\n\n{_origin(content)}\n"
+
+
+def _origin(content: dict[str, Any]) -> str:
+    return f"`{content['command']}`, {content['date']}, commit {content['commit']}, {content['machine']}."
 
 
 def _decimals(value: float) -> int:

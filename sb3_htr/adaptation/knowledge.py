@@ -13,8 +13,6 @@ from sb3_htr.common.type_aliases import Context
 # Quantiles of what unrewarded and rewarded steps return beside what the model says is task-free; rewards are told from the
 # model's errors by the middle between the two
 UNREWARDED, REWARDED = 0.999, 0.001
-# Networks see the tasks of a bank as so many, or twice as many, and so on: of each new shape, oneDNN keeps something for good
-BLOCK = 64
 # Before anything is known, above 0 and below what a success is worth where it is worth 1
 INITIAL_THRESHOLD = 0.5
 
@@ -124,7 +122,7 @@ class LatentKnowledge(nn.Module):
 
     def _solved(self, policy: ContextualPolicy, bank: TaskBank, gamma: float) -> Particles:
         """A particle for each solved task; sets beside them what tells rewards from what is task-free."""
-        solved, columns, model = bank.solved(multiple=BLOCK), bank.transitions, policy.reward_model
+        solved, columns, model = bank.solved(), bank.transitions, policy.reward_model
         data = th.as_tensor(solved.rows, device=policy.device)
         lengths = th.as_tensor(solved.lengths, device=policy.device)
         action, reward = data[:, columns.action], data[:, columns.reward]
@@ -139,11 +137,10 @@ class LatentKnowledge(nn.Module):
         chance = model.success_logits(states, tasks).sigmoid() * success[:, None]
         expected = chance * model.success_rewards(states, tasks).clamp(min=0)
         n_rewarded = th.zeros_like(z[:, 0]).index_add(0, episode, success.to(z.dtype)).clamp(min=1)[:, None]
-        n = bank.n_solved
         overlap, earned = (th.zeros(len(z), len(z), device=z.device).index_add(0, episode, x) for x in (chance, expected))
-        z, n_rewarded, overlap, earned = z[:n], n_rewarded[:n], overlap[:n, :n] / n_rewarded[:n], earned[:n, :n]
+        overlap /= n_rewarded
         share = (earned / earned.diag().clamp(min=1e-6)[:, None]).clamp(0, 1.2).fill_diagonal_(1)
-        is_train, returns = (th.as_tensor(x[:n], device=z.device) for x in (solved.is_train, solved.returns))
+        is_train, returns = (th.as_tensor(x, device=z.device) for x in (solved.is_train, solved.returns))
         task_free = model.task_free(obs, action, next_obs)
         self.task_free_value.copy_(task_free.mean() / max(1 - gamma, 1e-3))
         beside = reward - task_free

@@ -185,13 +185,11 @@ class TaskBank:
         """Number of training tasks that some episode would have solved."""
         return int((self.length[: self.n_train] > 0).sum())
 
-    def solved(self, multiple: int = 1) -> SolvedTasks:
+    def solved(self) -> SolvedTasks:
         """
-        :param multiple: of which the number of tasks shall be one; the first ones are repeated
         :return: the tasks that some episode would have solved
         """
         chosen = np.flatnonzero(self.length)
-        chosen = np.resize(chosen, len(chosen) + -len(chosen) % multiple)
         lengths = self.length[chosen]
         rows = self.episodes[chosen][np.arange(self.context_size) < lengths[:, None]]
         tasks = np.repeat(self.tasks[chosen], lengths, axis=0)

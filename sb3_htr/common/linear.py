@@ -140,6 +140,8 @@ def _product_of_columns(a: th.Tensor, b: th.Tensor) -> th.Tensor:
 def _run(x: th.Tensor, layers: list[_Layer], parameters: list[th.Tensor]) -> th.Tensor:
     # Of a slice of columns, as a context is one of the stored rows, oneDNN's product takes a hundred times as long
     x = x.contiguous()
+    if n_padding := _n_padding(len(x)):
+        return _run(F.pad(x, (0, 0, 0, n_padding)), layers, parameters)[: len(x)]
     if th.is_grad_enabled():
         result: th.Tensor = _Stack.apply(x, layers, *parameters)
         return result
@@ -147,6 +149,14 @@ def _run(x: th.Tensor, layers: list[_Layer], parameters: list[th.Tensor]) -> th.
     for layer in layers:
         x, _ = _forward(x, layer, *(next(remaining) for _ in range(layer.n_parameters)))
     return x
+
+
+def _n_padding(n: int) -> int:
+    """
+    Rows of zeros behind n rows, a sixteenth of them at most above 1024. oneDNN prepares a product for each shape, which takes
+    longer than the product, and keeps the latest thousand.
+    """
+    return -n % max(MIN_ROWS, 1 << n.bit_length() - 5)
 
 
 def _suits_onednn(x: th.Tensor) -> bool:

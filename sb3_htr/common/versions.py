@@ -2,8 +2,10 @@
 
 import platform
 import subprocess
+from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 PACKAGES = ("sb3_htr", "stable_baselines3", "sb3_contrib", "gymnasium", "rl_zoo3", "torch", "numpy", "mujoco")
 
@@ -21,8 +23,9 @@ def versions() -> dict[str, str]:
     return result
 
 
-def commit() -> dict[str, str | bool]:
+def commit(*paths: str) -> dict[str, str | bool]:
     """
+    :param paths: git's, of what counts as changed; all by default
     :return: ``commit`` of the code that runs, and whether its working tree was ``clean``; nothing outside a checkout
     """
 
@@ -33,7 +36,15 @@ def commit() -> dict[str, str | bool]:
     try:
         # An installed package may lie within a checkout of something else
         git("ls-files", "--error-unmatch", Path(__file__).name)
-        changes = git("status", "--porcelain", "--untracked-files=no")
+        changes = git("status", "--porcelain", "--untracked-files=no", "--", *paths)
         return {"commit": git("rev-parse", "--short=10", "HEAD"), "clean": not changes}
     except (OSError, subprocess.CalledProcessError):
         return {}
+
+
+def named(code: Mapping[str, Any]) -> str:
+    """
+    :param code: ``commit`` and ``clean``, as of :func:`commit`
+    :return: the commit, and whether it was changed
+    """
+    return f"{code.get('commit', 'unknown')}{'' if code.get('clean', True) else ' with changes'}"

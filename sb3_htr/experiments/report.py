@@ -132,6 +132,20 @@ def _processor() -> str:
     return platform.processor() or platform.machine()
 
 
+def check(results: dict[Cell, Path]) -> None:
+    """
+    :param results: raw results of cells
+    :raises ValueError: if one lacks something, as those of older versions do
+    """
+    for cell, path in results.items():
+        needed = {"solved", "elapsed_s", *COMMITS, *(f"returns_{evaluation.name}" for evaluation in cell.evaluations)}
+        if missing := sorted(needed - set(np.load(path).files)):
+            raise ValueError(
+                f"{path} is of another version, and lacks {missing}: remove it. The same command then evaluates its run "
+                "again, without training it again."
+            )
+
+
 def write(command: str, experiment: Experiment, results: dict[Cell, Path], folder: Path) -> None:
     """
     Write ``summary.json``, ``raw.npz`` and the pictures of an experiment.
@@ -140,7 +154,9 @@ def write(command: str, experiment: Experiment, results: dict[Cell, Path], folde
     :param experiment: draws the picture
     :param results: raw results of its cells
     :param folder: where they go
+    :raises ValueError: if a result lacks something; nothing is written then
     """
+    check(results)
     folder.mkdir(parents=True, exist_ok=True)
     raw = {f"{cell.name}/{key}": value for cell, path in results.items() for key, value in np.load(path).items()}
     with atomic_path(folder / "raw.npz") as path:

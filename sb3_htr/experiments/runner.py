@@ -1,7 +1,7 @@
 """One cell, in whatever process an executor calls it: claimed, trained from where it was, and evaluated."""
 
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from itertools import takewhile
 from pathlib import Path
@@ -13,7 +13,7 @@ from filelock import FileLock, Timeout
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.resume import checkpoints
-from sb3_htr.common.versions import commit
+from sb3_htr.common.versions import commit, named
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.protocol import evaluate
 from sb3_htr.zoo.commands import train
@@ -89,8 +89,8 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
         "solved": evaluations["successes"][..., -1],
         "elapsed_s": seconds_at(run / "progress.csv", evaluations["timesteps"]),
         # Of the code as it was when the training began, and as it is now
-        "commit": _named(read_record(run / RECORD)),
-        "evaluation_commit": _named(commit()),
+        "commit": named(read_record(run / RECORD)),
+        "evaluation_commit": named(commit()),
         **evaluate(cell, model),
     }
 
@@ -138,8 +138,3 @@ def _logged(file: Path) -> Iterator[None]:
         except Exception:
             traceback.print_exc()
             raise
-
-
-def _named(code: Mapping[str, Any]) -> str:
-    """The commit of some code, and whether it was changed."""
-    return f"{code.get('commit', 'unknown')}{'' if code.get('clean', True) else ' with changes'}"

@@ -2,6 +2,7 @@
 
 import copy
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch as th
@@ -56,6 +57,24 @@ def test_results_and_gradients_are_those_of_torch(n: int, n_in: int, n_out: int,
     loss_weight = th.randn(n, n_out)
     for actual, expected in zip(gradients(ours, x, loss_weight), gradients(torchs, x, loss_weight), strict=True):
         th.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_onednn_meets_few_shapes_however_many_rows_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It prepares something for each, which takes time and memory."""
+    shapes, fastest = set(), linear.onednn
+    assert fastest is not None
+
+    def product(x: th.Tensor, *others: Any) -> th.Tensor:
+        shapes.add(len(x))
+        return fastest(x, *others)
+
+    monkeypatch.setattr(linear, "onednn", product)
+    layer = Linear(128, 128)
+    with th.no_grad():
+        for n in range(MIN_ROWS, 2_000):
+            assert layer(th.zeros(n, 128)).shape == (n, 128)
+    assert 10 < len(shapes) < 50
+    assert max(shapes) < 2_100
 
 
 @pytest.mark.parametrize("dtype", [th.float64, th.bfloat16])

@@ -114,6 +114,15 @@ def test_what_an_algorithm_does_not_tell_is_null(tmp_path: Path, monkeypatch: py
     json.dumps(summary, allow_nan=False)
 
 
+def test_a_result_of_an_older_version_is_named_before_anything_is_written(tmp_path: Path) -> None:
+    results = made_up(EXPERIMENTS["held_out_sector"].cells(1), tmp_path)
+    path = list(results.values())[-1]
+    np.savez(path, **{key: value for key, value in np.load(path).items() if key != "solved"})
+    with pytest.raises(ValueError, match=rf"{path.name} is of another version, and lacks \['solved'\]: remove it"):
+        report.write("", EXPERIMENTS["held_out_sector"], results, tmp_path / "results")
+    assert not (tmp_path / "results").exists()
+
+
 @pytest.mark.parametrize("experiment", EXPERIMENTS.values(), ids=EXPERIMENTS)
 def test_the_grid_is_what_it_says(experiment: Any) -> None:
     cells = experiment.cells()
