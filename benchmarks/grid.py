@@ -1,4 +1,4 @@
-"""Throughput of a grid of 24 short cells: one after the other, and on a Ray cluster of two nodes of one core."""
+"""Throughput of a grid of 24 short cells: on a Ray cluster of two nodes of one core, one after the other, and two at a time."""
 
 import os
 import tempfile
@@ -50,9 +50,13 @@ def main() -> None:
     """One thread for each cell."""
     if find_spec("ray") is None:
         return print("Not measured: it needs Ray, pip install '.[ray]'.")
-    serial, two = cells_per_minute(Processes(1)), on_two_nodes()
+    nodes, serial, processes = on_two_nodes(), cells_per_minute(Processes(1)), cells_per_minute(Processes(2))
     name = f"{N_CELLS} cells of {N_TIMESTEPS:,} env steps, two nodes"
-    write("grid", [Figure(name, "cells/min", two, serial, two / serial, 1.9, "one after the other")])
+    alternatives = {"one after the other": (serial, 1.9), "two processes of this machine, without Ray": (processes, None)}
+    write(
+        "grid",
+        [Figure(name, "cells/min", nodes, other, nodes / other, goal, what) for what, (other, goal) in alternatives.items()],
+    )
 
 
 if __name__ == "__main__":
