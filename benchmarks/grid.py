@@ -1,4 +1,4 @@
-"""Throughput of a grid of 24 short cells: on a Ray cluster of two nodes of one core, one after the other, and two at a time."""
+"""Throughput of a grid of 24 short cells: on a Ray cluster of two nodes of one core, and without it, one or two at a time."""
 
 import os
 import tempfile
