@@ -36,6 +36,16 @@ def n_seeds(results: Results) -> int:
     return len({cell.seed for cell in results})
 
 
+def label(variant: str, runs: list[tuple[Cell, Any]], results: Results) -> str:
+    """
+    :param variant: its name
+    :param runs: of this variant
+    :param results: of all
+    :return: the name, with the number of runs where others have more
+    """
+    return variant if len(runs) == n_seeds(results) else f"{variant} (seeds: {len(runs)})"
+
+
 def learning(results: Results, path: Path) -> None:
     """
     Left: learning curves on validation tasks. Right: the final models' adaptation to the test tasks, by the first explorer of
@@ -48,12 +58,13 @@ def learning(results: Results, path: Path) -> None:
     groups = by_variant(results)
     for (colour, _), (variant, runs) in zip(curve_styles([*groups]), groups.items(), strict=True):
         curve = np.stack([raw["curve"].mean(axis=1) for _, raw in runs])
-        band(left, runs[0][1]["timesteps"] / 1000, curve, colour, "-", variant)
+        band(left, runs[0][1]["timesteps"] / 1000, curve, colour, "-", label(variant, runs, results))
         explorers = [evaluation.explorer for evaluation in runs[0][0].evaluations if not evaluation.tested_on]
         styles = {"prior": "--", **dict.fromkeys(explorers[:1], "-")}
         for explorer in [explorer for explorer in explorers if explorer in styles]:
             returns = np.stack([raw[f"returns_{explorer}"] for _, raw in runs])
             band(right, np.arange(1, returns.shape[-1] + 1), returns, colour, styles[explorer], f"{variant}, {explorer}")
+    left.set_xlim(left=0)
     left.set_xlabel("thousand env steps of meta-training")
     left.set_ylabel("return of the last adaptation episode")
     left.set_title("validation tasks, during meta-training", fontsize=10)
@@ -75,9 +86,9 @@ def race(results: Results, path: Path) -> None:
     groups = by_variant(results)
     for (colour, _), (variant, runs) in zip(curve_styles([*groups]), groups.items(), strict=True):
         solved = np.stack([100 * raw["solved"].mean(axis=1) for _, raw in runs])
-        label = variant if len(runs) == n_seeds(results) else f"{variant} (seeds: {len(runs)})"
-        band(left, runs[0][1]["timesteps"] / 1000, solved, colour, "-", label)
-        band(right, np.mean([raw["elapsed_s"] for _, raw in runs], axis=0) / 60, solved, colour, "-", label)
+        name = label(variant, runs, results)
+        band(left, runs[0][1]["timesteps"] / 1000, solved, colour, "-", name)
+        band(right, np.mean([raw["elapsed_s"] for _, raw in runs], axis=0) / 60, solved, colour, "-", name)
     for axes in (left, right):
         axes.set_xscale("log")
         axes.xaxis.set_major_formatter("{x:g}")
