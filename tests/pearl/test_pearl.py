@@ -15,6 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import SubprocVecEnv
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from helpers import ENV_ID, PRIOR, ROLLOUT, TINY, MakePEARL, parameters, with_policy
 from helpers.experience import assert_same
@@ -91,6 +92,25 @@ def test_the_precision_of_matrix_products_is_that_of_updates_only(tiny_pearl: Ma
     monkeypatch.setattr(model, "_update", watched)
     model.learn(ROLLOUT)
     assert seen == {"medium"} and th.get_float32_matmul_precision() == "highest"
+
+
+def test_an_update_waits_for_no_value(tiny_pearl: MakePEARL) -> None:
+    """What a GPU computes is asked for once in ``train``, not in each update: operations that need a value on the CPU."""
+    model = tiny_pearl().learn(2 * ROLLOUT)
+    seen: set[str] = set()
+
+    class Watch(TorchDispatchMode):
+        def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+            seen.add(func.overloadpacket.__name__)
+            return func(*args, **(kwargs or {}))
+
+    with Watch():
+        model._update(model.batch_size)
+    assert {"native_layer_norm", "_fused_adam_", "_foreach_lerp_"} <= seen
+    assert not seen & {"_local_scalar_dense", "nonzero", "masked_select", "_unique2", "equal", "is_nonzero"}
+    with Watch():
+        float(th.ones(1))
+    assert "_local_scalar_dense" in seen
 
 
 def test_sampled_actions_are_those_of_the_distribution_of_sac(tiny_pearl: MakePEARL) -> None:
