@@ -50,10 +50,11 @@ def main(argv: Sequence[str]) -> None:
         raise ValueError(f"--cell is {args.cell}, expected 0 to {len(cells) - 1}: the experiment has {len(cells)} runs.")
     quick = "quick-" if args.quick else ""
     runs = (args.runs / "quick" if args.quick else args.runs).resolve()
-    report.check({cell: path for cell in cells if (path := cell.result(runs)).exists()})
+    chosen = cells if args.cell is None else [cells[args.cell]]
+    report.check({cell: path for cell in chosen if (path := cell.result(runs)).exists()})
     try:
         if args.cell is not None:
-            driver.Driver([cells[args.cell]], runs, executors.Here()).run()
+            driver.Driver(chosen, runs, executors.Here()).run()
             return
         driver.Driver(cells, runs, executors.Ray(args.ray) if args.ray else executors.Processes(args.jobs)).run()
     except KeyboardInterrupt:
