@@ -88,7 +88,7 @@ def race(results: Results, path: Path) -> None:
         solved = np.stack([100 * raw["solved"].mean(axis=1) for _, raw in runs])
         name = label(variant, runs, results)
         band(left, runs[0][1]["timesteps"] / 1000, solved, colour, "-", name)
-        band(right, np.mean([raw["elapsed_s"] for _, raw in runs], axis=0) / 60, solved, colour, "-", name)
+        band(right, np.mean([raw["elapsed_s"] for _, raw in runs], axis=0) / 60, solved, colour, "-", f"_{name}")
     for axes in (left, right):
         axes.set_xscale("log")
         axes.xaxis.set_major_formatter("{x:g}")
