@@ -174,6 +174,17 @@ def test_a_run_goes_on_from_another_folder_than_it_was_begun_in(tmp_path: Path, 
     assert (run / f"{ENV_ID}.zip").exists()
 
 
+def test_a_run_goes_on_where_the_package_lies_elsewhere(unbroken: Path, tmp_path: Path) -> None:
+    """On another node, or after an update."""
+    run = cut_off(unbroken, tmp_path)
+    record = json.loads((run / "run.json").read_text())
+    record["arguments"] = [str(tmp_path / "gone.yml") if word.endswith("pearl.yml") else word for word in record["arguments"]]
+    assert str(tmp_path / "gone.yml") in record["arguments"]
+    (run / "run.json").write_text(json.dumps(record))
+    assert main(["train", "--resume", str(run)]) == 0
+    assert_same_run(run, unbroken)
+
+
 def test_the_last_one_cleans_up(unbroken: Path, tmp_path: Path) -> None:
     """Killed after the last checkpoint was written and before older ones were removed, and while writing one."""
     run = cut_off(unbroken, tmp_path)

@@ -82,6 +82,9 @@ def main(argv: Sequence[str]) -> None:
         import_packages(args.gym_packages, record["gym_packages"], run / RECORD, args.trust)
         args.method = record["method"]
         algorithm = get_method(args.method).algorithm
+        # This package may lie elsewhere than the one that began the run; a file that the user gave comes later, and wins
+        defaults = ["--algo", algorithm.name, "-conf", algorithm.settings_file]
+        arguments[: len(defaults)] = defaults
         find_hidden(record["env_id"])
     else:
         if not wants_help and not env:
