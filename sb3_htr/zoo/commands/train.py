@@ -83,8 +83,8 @@ def main(argv: Sequence[str]) -> None:
         args.method = record["method"]
         algorithm = get_method(args.method).algorithm
         # This package may lie elsewhere than the one that began the run; a file that the user gave comes later, and wins
-        defaults = ["--algo", algorithm.name, "-conf", algorithm.settings_file]
-        arguments[: len(defaults)] = defaults
+        if arguments[0] == "--algo" and arguments[2] == "-conf":
+            arguments[3] = algorithm.settings_file
         find_hidden(record["env_id"])
     else:
         if not wants_help and not env:
