@@ -86,7 +86,7 @@ def race(results: Results, path: Path) -> None:
     groups = by_variant(results)
     for (colour, _), (variant, runs) in zip(curve_styles([*groups]), groups.items(), strict=True):
         solved = np.stack([100 * raw["solved"].mean(axis=1) for _, raw in runs])
-        name = label(variant, runs, results)
+        name = f"{label(variant, runs, results)}, {runs[0][0].evaluations[0].explorer}"
         band(left, runs[0][1]["timesteps"] / 1000, solved, colour, "-", name)
         band(right, np.mean([raw["elapsed_s"] for _, raw in runs], axis=0) / 60, solved, colour, "-", f"_{name}")
     for axes in (left, right):
