@@ -66,11 +66,28 @@ def loss_of_stability(raw: Raw, evaluation: str) -> np.ndarray:
 
 def env_steps_to_solved(raw: Raw, evaluation: str) -> np.ndarray:
     """(1, 1), env steps of the first evaluation with enough validation tasks solved; of one more than were made if never."""
-    steps, enough = raw["timesteps"], raw["solved"].mean(axis=1) >= SOLVED_SHARE
-    return np.atleast_2d(float(steps[enough.argmax()] if enough.any() else steps[-1] * (len(steps) + 1) / len(steps)))
+    return _when_solved(raw, raw["timesteps"])
 
 
-_ALL = (last_episode_return, success_rate, episodes_to_first_success, loss_of_stability, env_steps_to_solved)
+def seconds_to_solved(raw: Raw, evaluation: str) -> np.ndarray:
+    """(1, 1), the same in seconds of training, evaluations included."""
+    return _when_solved(raw, raw["elapsed_s"])
+
+
+def _when_solved(raw: Raw, clock: np.ndarray) -> np.ndarray:
+    """What the clock (n_evaluations,) shows."""
+    enough = raw["solved"].mean(axis=1) >= SOLVED_SHARE
+    return np.atleast_2d(float(clock[enough.argmax()] if enough.any() else clock[-1] * (len(clock) + 1) / len(clock)))
+
+
+_ALL = (
+    last_episode_return,
+    success_rate,
+    episodes_to_first_success,
+    loss_of_stability,
+    env_steps_to_solved,
+    seconds_to_solved,
+)
 METRICS: dict[str, Callable[[Raw, str], np.ndarray]] = {metric.__name__: metric for metric in _ALL}
 
 

@@ -50,7 +50,7 @@ def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monk
     assert all((raw[f"{cell.name}/returns_{cell.evaluations[0].name}"] == cell.seed).all() for cell in cells)
     summary = json.loads((folder / "summary.json").read_text())
     value = {"last_episode_return": 2.0, "success_rate": 1.0, "episodes_to_first_success": 3.0, "loss_of_stability": 1.0}
-    value["env_steps_to_solved"] = 3000.0
+    value |= {"env_steps_to_solved": 3000.0, "seconds_to_solved": 3.0}
     variants = {(cell.variant, str(cell.env_kwargs)): cell for cell in cells}
     for row in summary["rows"]:
         cell = variants[row["variant"], str(row["env_kwargs"])]
@@ -140,6 +140,7 @@ def test_the_grid_is_what_it_says(experiment: Any) -> None:
 def test_metrics() -> None:
     raw = {
         "timesteps": np.arange(1, 6) * 100,
+        "elapsed_s": np.arange(1, 6) * 7.5,
         "curve": np.array([[1.0], [9], [8], [5], [7]]),
         "solved": np.array([[0], [0], [1], [0], [1]]),
         "returns_a": np.arange(6.0).reshape(1, 2, 3),
@@ -152,7 +153,10 @@ def test_metrics() -> None:
         "episodes_to_first_success": [[2, 4]],
         "loss_of_stability": [[4]],
         "env_steps_to_solved": [[300]],
+        "seconds_to_solved": [[22.5]],
     }
+    never = {name: METRICS[name]({**raw, "solved": np.zeros((5, 1))}, "a").item() for name in METRICS if "_to_solved" in name}
+    assert never == {"env_steps_to_solved": 600, "seconds_to_solved": 45}
 
 
 def test_optimal_return_is_that_of_the_env() -> None:
