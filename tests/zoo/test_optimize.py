@@ -42,8 +42,10 @@ def check_search(folder: Path, storage: str, capsys: pytest.CaptureFixture[str],
     study = optimize.create_study(storage, "test")
     assert [trial.number for trial in study.get_trials()] == [0, 1, 2]
     output = capsys.readouterr().out
-    say = f"sb3-htr train --env {ENV_ID}{f' --method {method}' if method else ''} --study-name test --storage {storage}"
-    assert f"{say} --trial-id {study.best_trial.number}\n" in output
+    study_of = f"--study-name test --storage {shlex.quote(storage)}"
+    say = f"sb3-htr train --env {ENV_ID}{f' --method {method}' if method else ''} {study_of}"
+    given = f"--env-kwargs goal_distance:0.1 {shlex.join(SMALL)}"
+    assert f"{say} --trial-id {study.best_trial.number} {given}\n" in output
     assert len(list(folder.glob("*/report_*.csv"))) >= 1 and not list(folder.glob(f"*/{ENV_ID}_*"))
     arguments = [*shlex.split(say)[1:], "-f", str(folder), "-n", "240", "--eval-freq", "-1", "--verbose", "0"]
     assert main([*arguments, "--trial-id", "0", *SMALL]) == 0
@@ -164,6 +166,30 @@ def test_what_is_sampled_makes_a_model_of_the_method_and_is_what_is_loaded(name:
         assert buffer is not None and type(buffer.relabeller).__name__ == method.relabeller
         sampled_probabilities.add(buffer.relabel_probability)
     assert len(sampled_probabilities) > 1 if relabels else sampled_probabilities == {0.0}
+
+
+def test_what_a_user_gives_is_not_searched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[PEARL] = []
+    set_up = PEARL._setup_model
+
+    def watched(model: PEARL) -> None:
+        made.append(model)
+        set_up(model)
+
+    monkeypatch.setattr(PEARL, "_setup_model", watched)
+    given = {key: value for key, value in TINY.items() if key != "seed"}
+    given["policy_kwargs"] = {"net_arch": [16], "encoder_arch": [16]}
+    params = ["-params", *(f"{key}:{value!r}" for key, value in given.items()), "n_envs:4", "gamma:0.5"]
+    storage = f"sqlite:///{tmp_path}/s.db"
+    arguments = ["optimize", "--env", ENV_ID, "-f", str(tmp_path), "-n", "480", "--n-trials", "1", "--n-evaluations", "1"]
+    assert main([*arguments, "--storage", storage, "--study-name", "test", "--verbose", "0", *params]) == 0
+    (trial,) = optimize.create_study(storage, "test").get_trials()
+    searched = {"learning_rate", "tau", "ent_coef", "kl_coef", "latent_dim", "relabel_probability", "hindsight_task_strategy"}
+    assert set(trial.params) == searched
+    (model,) = made
+    assert (model.gamma, model.gradient_steps, model.batch_size, model.meta_batch_size) == (0.5, 3, 4, 8)
+    assert (model.policy.net_arch, model.policy.encoder_arch) == ([16], [16])
+    assert (model.policy.latent_dim, model.tau) == (trial.params["latent_dim"], trial.params["tau"])
 
 
 def test_a_trial_joins_the_settings_of_the_file(tmp_path: Path) -> None:

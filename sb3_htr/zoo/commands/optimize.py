@@ -3,6 +3,7 @@
 import argparse
 import importlib
 import logging
+import shlex
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,10 +19,12 @@ HELP = """sb3-htr optimize: rl_zoo3's `train -optimize` (its arguments follow) f
 
 The objective is the mean return of the last adaptation episode on the validation tasks; the test tasks stay unseen.
 The search space is in sb3_htr/zoo/run/search_space.py; what it does not name stays as in the YAML file.
+What -params names stays as given, and is not searched.
 
 examples:
   sb3-htr optimize --env SparsePointRobot-v0 -n 40000 --n-trials 20
   sb3-htr optimize --env SparsePointRobot-v0 -n 40000 --study-name htr --storage sqlite:///study.db --max-total-trials 50
+  sb3-htr optimize ... -params gradient_steps:200 "policy_kwargs:{'net_arch':[64,64]}"
   sb3-htr optimize ... --study-name htr --storage postgresql+psycopg://user:password@host/database
   sb3-htr train --env SparsePointRobot-v0 --study-name htr --storage sqlite:///study.db --trial-id 7
 
@@ -77,6 +80,8 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--storage")
     parser.add_argument("--study-name")
     parser.add_argument("--method")
+    parser.add_argument("-params", "--hyperparams", nargs="+")
+    parser.add_argument("--env-kwargs", nargs="+")
     args, _ = parser.parse_known_args(argv)
     if args.storage and not args.study_name:
         raise ValueError(
@@ -97,10 +102,11 @@ def main(argv: Sequence[str]) -> None:
     if not any(values):
         print(f"No trial learnt anything: the return after adaptation is 0 in all {len(values)}. Make the trials longer (-n).")
     else:
-        method = f" --method {args.method}" if args.method else ""
-        where = f"--study-name {args.study_name} --storage {args.storage}"
-        trial = f"{where} --trial-id {study.best_trial.number}"
-        print(f"Train with the best trial so far: sb3-htr train --env {args.env}{method} {trial}")
+        command = ["sb3-htr", "train", "--env", args.env, *(["--method", args.method] if args.method else [])]
+        command += ["--study-name", args.study_name, "--storage", args.storage, "--trial-id", str(study.best_trial.number)]
+        for option, values in (("--env-kwargs", args.env_kwargs), ("-params", args.hyperparams)):
+            command += [option, *values] if values else []
+        print(f"Train with the best trial so far: {shlex.join(command)}")
 
 
 def _is_news(record: logging.LogRecord) -> bool:

@@ -41,7 +41,7 @@ from sb3_htr.zoo.run.agents import RECORD, read_record
 from sb3_htr.zoo.run.algorithm import Algorithm
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback, ProgressCallback
 from sb3_htr.zoo.run.folder import claim, lock
-from sb3_htr.zoo.run.method import DEFAULT, PEARLMethod, get_method, merged
+from sb3_htr.zoo.run.method import DEFAULT, PEARLMethod, get_method, merged, names_of
 from sb3_htr.zoo.run.search_space import convert_pearl_params, sample_pearl_params
 from sb3_htr.zoo.run.trust import plain_settings
 
@@ -94,6 +94,7 @@ class MetaExperimentManager(ExperimentManager):
         hyperparams = self.method.settings(plain_settings(hyperparams, self.config, self.trust))
         if self.resumed is not None:  # what a user gave comes from a file now
             given = plain_settings(given, self.resumed / RECORD, self.trust)
+        self._given = names_of(given)
         hyperparams = merged(merged(hyperparams, self._trial(trial_id)), given)
         saved = OrderedDict(sorted(hyperparams.items()))
         print(f"Method {self.method.name}: {self.config} has the settings of the env. With those of the command line:")
@@ -251,7 +252,11 @@ class MetaExperimentManager(ExperimentManager):
         """
         try:
             assert isinstance(self.method, PEARLMethod)
-            how = self.method.relabel_probability > 0, "hindsight_task_strategy" in self.method.relabeller_settings()
+            how = (
+                self.method.relabel_probability > 0,
+                "hindsight_task_strategy" in self.method.relabeller_settings(),
+                self._given,
+            )
             HYPERPARAMS_SAMPLER[self.algo] = lambda trial, *_: merged(self._hyperparams, sample_pearl_params(trial, *how))
             return super().objective(trial)
         except DivergedError as error:

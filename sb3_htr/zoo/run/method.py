@@ -1,6 +1,6 @@
 """What is compared: a method, by one name."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
@@ -183,3 +183,11 @@ def merged(first: dict[str, Any], second: dict[str, Any]) -> dict[str, Any]:
             before = {"name": before}
         result[key] = merged(before, value) if isinstance(before, dict) and isinstance(value, dict) else value
     return result
+
+
+def names_of(settings: Mapping[str, Any]) -> set[str]:
+    """
+    :param settings: may have dicts of settings
+    :return: their names, and those of what is in the dicts
+    """
+    return {*settings}.union(*(names_of(value) for value in settings.values() if isinstance(value, Mapping)))
