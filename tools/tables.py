@@ -15,10 +15,18 @@ ENVS = ("point_robot", "wheeled", "ant", "fetch_reach")
 METHODS = ("htr-ser", "pearl-dense", "pearl-sparse", "pearl-sparse-prior")
 EXPLORERS = ("belief", "prior")
 COLUMNS = {
-    "last_episode_return": "return of the 20th episode",
+    "last_episode_return": "return of episode {n_episodes}",
     "success_rate": "tasks solved in it",
     "episodes_to_first_success": "episodes to the first success",
 }
+
+
+def columns(n_episodes: int) -> list[str]:
+    """
+    :param n_episodes: of an adaptation
+    :return: heads of the columns of scores
+    """
+    return [head.format(n_episodes=n_episodes) for head in COLUMNS.values()]
 
 
 def table(summary: dict[str, Any]) -> str:
@@ -35,7 +43,7 @@ def table(summary: dict[str, Any]) -> str:
         key = (*(str(row["env_kwargs"][setting]) for setting in settings), row["variant"], f"`{row['explorer']}`", *place)
         lines.setdefault(key, {})[row["metric"]] = f"{row['iqm']:.2f} [{row['low']:.2f}, {row['high']:.2f}]"
     settings = [setting.replace("_", " ") for setting in settings]
-    head = [*settings, "method", "explorer", *["tested on"] * has_places, *COLUMNS.values()]
+    head = [*settings, "method", "explorer", *["tested on"] * has_places, *columns(rows[0].get("n_episodes", 20))]
     body = [[*key, *(cells[metric] for metric in COLUMNS)] for key, cells in lines.items()]
     env_steps = " / ".join(f"{n:,}" for n in sorted({row["env_steps"] for row in rows}))
     about = f"{rows[0]['env']}, {env_steps} env steps, {_runs(rows)}."
@@ -70,7 +78,7 @@ def headline(summaries: dict[str, dict[str, Any]]) -> str:
     :param summaries: contents of ``summary.json`` by their names, those of ``ENVS`` among them where they are there
     :return: Markdown table, one line per env, method and explorer
     """
-    lines = [["env", "env steps", "seeds", "method", "explorer", *COLUMNS.values()]]
+    lines = [["env", "env steps", "seeds", "method", "explorer", *columns(20)]]
     lines.append(["---"] * len(lines[0]))
     for summary in (summaries[name] for name in ENVS if name in summaries):
         scores: dict[tuple[str, ...], dict[str, str]] = {}

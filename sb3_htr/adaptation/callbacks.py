@@ -22,31 +22,30 @@ class MetaEvalCallback(EvalCallback):
     The score is the mean return of the last adaptation episode over the tasks. ``best_model.zip`` is chosen by it, on
     validation tasks by default, so that the test tasks stay unseen until the end. ``evaluations.npz`` has ``timesteps``
     (n,), ``results`` (n, n_tasks), the returns of the last episode, and ``returns`` and ``successes``
-    (n, n_tasks, n_adaptation_episodes).
+    (n, n_tasks, n_eval_episodes).
 
     :param eval_env: env of the task family
     :param tasks: ``"validation"``, ``"test"`` or task vectors (n_tasks, task_dim)
-    :param n_adaptation_episodes: episodes per task (PEARL's reference: 20)
+    :param n_eval_episodes: adaptation episodes per task (PEARL's reference: 20)
     :param explorer: an :class:`sb3_htr.adaptation.Explorer`, its name, or its name and settings; the model's own by default
-    :param kwargs: arguments of SB3's ``EvalCallback``; ``n_eval_episodes`` has no effect, each task is adapted to once
+    :param kwargs: arguments of SB3's ``EvalCallback``
     """
 
     def __init__(
         self,
         eval_env: Any,
-        *args: Any,
+        *,
         tasks: str | np.ndarray = "validation",
-        n_adaptation_episodes: int = 20,
+        n_eval_episodes: int = 20,
         explorer: Any = None,
         **kwargs: Any,
     ) -> None:
-        super().__init__(eval_env, *args, **kwargs)
+        super().__init__(eval_env, n_eval_episodes=n_eval_episodes, **kwargs)
         if isinstance(tasks, str):
             if tasks not in ("validation", "test"):
                 raise ValueError(f'tasks is {tasks!r}, expected "validation", "test" or an array of task vectors.')
             tasks = getattr(get_task_family(self.eval_env), f"{tasks}_tasks")
         self.tasks: np.ndarray = np.asarray(tasks)
-        self.n_adaptation_episodes = n_adaptation_episodes
         self.explorer = None if explorer is None else to_explorer(explorer)
         self.returns: list[np.ndarray] = []
         self.successes: list[np.ndarray] = []
@@ -86,7 +85,7 @@ class MetaEvalCallback(EvalCallback):
             cast(MetaLearner, self.model),
             self.eval_env,
             self.tasks,
-            self.n_adaptation_episodes,
+            self.n_eval_episodes,
             explorer=self.explorer,
             deterministic=self.deterministic,
         )

@@ -38,6 +38,7 @@ class Cell:
     :param seed: seed of the run
     :param n_timesteps: budget of env steps
     :param eval_freq: env steps between evaluations on the validation tasks
+    :param n_episodes: adaptation episodes on a task, whenever one is adapted to
     :param settings: hyperparameters, joined with those of env and method
     :param env_kwargs: arguments of the env
     :param evaluations: what is done with the final model; one row of results for each
@@ -52,6 +53,7 @@ class Cell:
     seed: int
     n_timesteps: int
     eval_freq: int
+    n_episodes: int
     settings: KwArgs
     env_kwargs: KwArgs
     evaluations: tuple[Evaluation, ...]
@@ -87,7 +89,7 @@ class Cell:
         return [
             *("--env", self.env_id, "--method", self.method),
             *("-f", str(folder), "--verbose", "0", "-n", str(self.n_timesteps)),
-            *("--seed", str(self.seed), "--eval-freq", str(self.eval_freq)),
+            *("--seed", str(self.seed), "--eval-freq", str(self.eval_freq), "--eval-episodes", str(self.n_episodes)),
             *(["-params", *settings] if settings else []),
             *(["--env-kwargs", *kwargs] if kwargs else []),
             *(["--gym-packages", *self.gym_packages] if self.gym_packages else []),

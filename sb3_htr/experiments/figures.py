@@ -134,8 +134,8 @@ def goal_distance(results: Results, path: Path) -> None:
             # (n_seeds, n_eval_seeds, n_tasks, n_distances)
             band(axes, np.array(x), np.stack(np.split(values, len(x)), axis=-1), colour, "-", variant)
     left.axhline(1, color=COLOURS[6], linestyle=":", linewidth=1)
-    left.set_ylabel("return of the 20th episode / optimum")
-    right.set_ylabel("test tasks solved in the 20th episode")
+    left.set_ylabel("return of the last episode / optimum")
+    right.set_ylabel("test tasks solved in the last episode")
     for axes in (left, right):
         axes.set_xlabel("distance of the goals (1.5: 30 steps, 2: 40 steps, else 20)")
         axes.set_ylim(-0.03, 1.05)
@@ -160,7 +160,7 @@ def relabelling(results: Results, path: Path) -> None:
         label = "one seed" if k == 0 else None
         left.plot([k] * len(values), values.mean(axis=(1, 2)), "o", color=COLOURS[6], markersize=3, label=label)
     left.set_xlabel("K, probability of relabelling")
-    left.set_ylabel("return of the 20th adaptation episode")
+    left.set_ylabel("return of the last adaptation episode")
     left.set_title("test tasks, final models", fontsize=10)
     shown = [variant for variant in groups if variant == "K = 0.8" or not variant.startswith("K = ")]
     for (colour, _), variant in zip(curve_styles(shown), shown, strict=True):

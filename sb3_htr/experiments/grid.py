@@ -55,6 +55,7 @@ class Experiment:
     :param evaluations: what is done with the final models
     :param models_of: name of the experiment whose runs are tested; by default it trains its own
     :param figure: draws the results of all cells into a file
+    :param n_episodes: adaptation episodes on a task, in training's evaluations and in those of the final models
     """
 
     name: str
@@ -67,6 +68,7 @@ class Experiment:
     evaluations: tuple[Evaluation, ...] = by(EXPLORERS)
     models_of: str = ""
     figure: Callable[[dict[Cell, Path], Path], None] = figures.learning
+    n_episodes: int = 20
 
     def cells(self, seeds: int | None = None, scale: float = 1.0) -> list[Cell]:
         """
@@ -84,6 +86,7 @@ class Experiment:
                 seed=seed,
                 n_timesteps=int(self.n_timesteps * variant.budget * scale),
                 eval_freq=max(int(self.eval_freq * scale), 1),
+                n_episodes=self.n_episodes,
                 settings=variant.settings,
                 env_kwargs=variant.env_kwargs,
                 evaluations=self._evaluations_of(variant.method),

@@ -35,8 +35,12 @@ def evaluate(cell: Cell, model: Model) -> KwArgs:
         env_kwargs = {**cell.env_kwargs, **evaluation.tested_on}
         family = get_task_family(make_task_vec_env(cell.env_id, env_kwargs=env_kwargs))
         env = make_task_vec_env(cell.env_id, len(family.test_tasks), env_kwargs=env_kwargs)
-        explorer = ABLATIONS.get(evaluation.explorer, evaluation.explorer)
-        records = [evaluate_adaptation(model, env, explorer=explorer, seed=seed) for seed in EVAL_SEEDS]
+        # None is the model's own, with the settings that it was trained with
+        named = None if evaluation.explorer == model.explorer.name else evaluation.explorer
+        explorer = ABLATIONS.get(evaluation.explorer, named)
+        records = [
+            evaluate_adaptation(model, env, n_episodes=cell.n_episodes, explorer=explorer, seed=seed) for seed in EVAL_SEEDS
+        ]
         returns, successes = (np.stack(arrays) for arrays in zip(*records, strict=True))
         arrays |= {f"returns_{evaluation.name}": returns.astype(np.float32), f"successes_{evaluation.name}": successes}
     return {**arrays, "calibration": calibration(model, cell.env_id, cell.env_kwargs)}

@@ -49,6 +49,7 @@ class Runs(NamedTuple):
         first = self.cells[0]
         what = {"env": first.env_id, "env_kwargs": first.env_kwargs, "method": first.method, "variant": first.variant}
         settings = {"settings": first.settings, "env_steps": first.n_timesteps, "n_seeds": len(self.cells)}
+        settings["n_episodes"] = first.n_episodes
         return {**what, **settings, **evaluation._asdict()}
 
     def means(self) -> dict[str, float | None]:

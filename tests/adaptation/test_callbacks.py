@@ -16,7 +16,7 @@ from sb3_htr.common.vec_env import make_task_vec_env
 def test_meta_eval_logs_keeps_the_best_and_writes_npz(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
     env = make_task_vec_env(ENV_ID, 20)
     callback = MetaEvalCallback(
-        env, eval_freq=50, log_path=str(tmp_path), best_model_save_path=str(tmp_path), n_adaptation_episodes=3, verbose=0
+        env, eval_freq=50, log_path=str(tmp_path), best_model_save_path=str(tmp_path), n_eval_episodes=3, verbose=0
     )
     model = tiny_pearl().learn(3 * ROLLOUT, callback=callback)
     data = np.load(tmp_path / "evaluations.npz")
@@ -42,7 +42,7 @@ def test_meta_eval_explores_as_it_is_told(tiny_pearl: MakePEARL) -> None:
     env, prior = make_task_vec_env(ENV_ID, 20), {"name": "prior", "n_exploration_episodes": 9}
     # Otherwise what observations are normalized by follows the rollout, at whose last step the callback comes
     model = tiny_pearl(learning_starts=1000, policy_kwargs=with_policy(normalize_observations=False))
-    callback = MetaEvalCallback(env, explorer=prior, eval_freq=60, n_adaptation_episodes=2, verbose=0)
+    callback = MetaEvalCallback(env, explorer=prior, eval_freq=60, n_eval_episodes=2, verbose=0)
     model.learn(ROLLOUT, callback=callback)
     expected, _ = evaluate_adaptation(model, env, callback.tasks, n_episodes=2, explorer=prior)
     np.testing.assert_array_equal(callback.returns[0], expected)
@@ -54,7 +54,7 @@ def test_meta_eval_explores_as_it_is_told(tiny_pearl: MakePEARL) -> None:
 def test_a_full_disk_stops_no_evaluation(tiny_pearl: MakePEARL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     env = make_task_vec_env(ENV_ID, 20)
     callback = MetaEvalCallback(
-        env, eval_freq=60, n_adaptation_episodes=2, log_path=str(tmp_path), best_model_save_path=str(tmp_path), verbose=0
+        env, eval_freq=60, n_eval_episodes=2, log_path=str(tmp_path), best_model_save_path=str(tmp_path), verbose=0
     )
     calls = []
 
@@ -75,7 +75,7 @@ def test_a_best_model_that_could_not_be_written_is_not_the_best(
     tiny_pearl: MakePEARL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     callback = MetaEvalCallback(
-        make_task_vec_env(ENV_ID, 20), eval_freq=60, n_adaptation_episodes=2, best_model_save_path=str(tmp_path), verbose=0
+        make_task_vec_env(ENV_ID, 20), eval_freq=60, n_eval_episodes=2, best_model_save_path=str(tmp_path), verbose=0
     )
     model = tiny_pearl()
     save, paths = type(model).save, []

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from helpers import ENV_ID
-from sb3_htr import PEARL
+from sb3_htr import PEARL, evaluate_adaptation, make_task_vec_env
 from sb3_htr.common.resume import checkpoints
 from sb3_htr.experiments import grid
 from sb3_htr.experiments.cell import Cell
@@ -106,6 +106,21 @@ def test_the_command_repeats_an_experiment(
     relabeller: Any = trained.replay_buffer_kwargs["relabeller"]
     assert relabeller["name"] == "EpisodeClustering" and relabeller["cell_size"] == 0.3
     assert plain.load().explorer.name == "prior"
+
+
+def test_explorers_and_episodes_are_those_of_the_experiment(tmp_path: Path) -> None:
+    """Of the training, its evaluations, and the final model's."""
+    explorer = {"name": "prior", "n_exploration_episodes": 2}
+    variant = Variant("pearl-sparse-prior", "", {**SMALL, "explorer": explorer}, {"n_test_tasks": 4, "goal_distance": 0.3})
+    experiment = Experiment("few", "", ENV_ID, 480, (variant,), 1, 480, by(("prior", "aggregate")), n_episodes=3)
+    (cell,) = experiment.cells()
+    assert run_cell(cell, tmp_path)
+    run, model = find_finished(cell, cell.run_folder(tmp_path)) or pytest.fail("there is one")
+    assert np.load(run / "evaluations.npz")["returns"].shape == (1, 20, 3)
+    raw = np.load(cell.result(tmp_path))
+    assert raw["returns_prior"].shape == raw["returns_aggregate"].shape == (2, 4, 3)
+    by_itself, _ = evaluate_adaptation(model, make_task_vec_env(ENV_ID, 4, env_kwargs=cell.env_kwargs), n_episodes=3, seed=1)
+    assert (raw["returns_prior"][0] == by_itself.astype(np.float32)).all()
 
 
 def test_one_cell_of_a_job_array_writes_no_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

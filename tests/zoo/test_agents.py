@@ -129,9 +129,10 @@ def test_normalized_agents_are_exported_with_their_statistics(tmp_path: Path, ti
     assert main(["enjoy", str(tmp_path / "agent.zip"), "--no-render", "--n-tasks", "1", "--n-episodes", "2"]) == 0
 
 
-def test_the_command_of_a_record_is_that_of_any_machine() -> None:
+@pytest.mark.parametrize("defaults", [["--save-freq", "20000"], ["--save-freq", "20000", "--eval-episodes", "20"]])
+def test_the_command_of_a_record_is_that_of_any_machine(defaults: list[str]) -> None:
     """What the trained agent was trained by, without local folders, and with the seed that was drawn."""
-    arguments = ["--algo", "pearl", "-conf", "/home/me/pearl.yml", "--num-threads", "1", "--save-freq", "20000"]
+    arguments = ["--algo", "pearl", "-conf", "/home/me/pearl.yml", "--num-threads", "1", *defaults]
     arguments += ["--env", ENV_ID, "-f", "/home/me/runs", "-P", "--seed", "3", "-params", "policy_kwargs:{'latent_dim': 3}"]
     command = model_card.training_command({"arguments": arguments, "seed": 4, "method": "htr-ec"})
     params = "-params 'policy_kwargs:{'\"'\"'latent_dim'\"'\"': 3}'"

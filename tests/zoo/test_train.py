@@ -152,7 +152,7 @@ def test_a_trial_can_be_pruned(tmp_path: Path) -> None:
             return len(self.reported) == 2
 
     trial = Trial()
-    callback = MetaTrialEvalCallback(make_task_vec_env(ENV_ID, 20), cast(Any, trial), eval_freq=20, n_adaptation_episodes=2)
+    callback = MetaTrialEvalCallback(make_task_vec_env(ENV_ID, 20), cast(Any, trial), eval_freq=20, n_eval_episodes=2)
     model = PEARL("MlpPolicy", ENV_ID, **TINY).learn(2400, callback=callback)
     assert callback.is_pruned and model.num_timesteps == 2 * 20 * 4
     assert [step for _, step in trial.reported] == [1, 2]

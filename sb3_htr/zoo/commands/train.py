@@ -8,6 +8,7 @@ from pathlib import Path
 from htr_envs.goal_env import find_hidden
 from sb3_htr.common.resume import n_steps_done
 from sb3_htr.zoo.run.agents import OF_TRAINING, RECORD, file_stem, find_run, read_record
+from sb3_htr.zoo.run.arguments import default_arguments, given_arguments
 from sb3_htr.zoo.run.manager import run_rl_zoo
 from sb3_htr.zoo.run.memory import keep_freed_memory
 from sb3_htr.zoo.run.method import DEFAULT, get_method, methods
@@ -24,13 +25,14 @@ examples:
   sb3-htr train --resume runs/htr-ser/SparsePointRobot-v0_1
 
 defaults here: -conf, the YAML file in hyperparams/ of the method's algorithm; --num-threads 1 --save-freq 20000
+               --eval-episodes 20, adaptation episodes on each validation task
 beside rl_zoo3's:
   --method NAME  htr-ser (default), htr-ec, pearl-dense, pearl-sparse; rivals: htr-hfr, htr-hipi, rl2, sac-her. Those of PEARL
                  with -prior behind it under PEARL's own protocol
   --resume RUN   go on with a run from its latest checkpoint, exactly; takes no other arguments but those below
                  and -n STEPS: so many more than planned; a learning rate that decays does so anew over what is then planned
   --trust        let files (YAML, the record of a run) import and evaluate what they name
-no effect here: --eval-episodes and --n-eval-envs (an evaluation adapts to each validation task once, in 20 episodes)
+no effect here: --n-eval-envs
 """
 
 
@@ -67,8 +69,8 @@ def main(argv: Sequence[str]) -> None:
         further, rest = more.parse_known_args(rest)
         rest += env
         if rest or args.method:
-            given = " ".join(rest) or "--method"
-            raise ValueError(f"train --resume goes on with the run's own arguments: leave {given} away.")
+            more_than_run = " ".join(rest) or "--method"
+            raise ValueError(f"train --resume goes on with the run's own arguments: leave {more_than_run} away.")
         run = find_run(args.resume)
         record = read_record(run / RECORD)
         if not {*OF_TRAINING} <= record.keys():
@@ -77,29 +79,24 @@ def main(argv: Sequence[str]) -> None:
         if n_steps_done(run) >= planned and (run / f"{file_stem(record['env_id'])}.zip").exists():
             print(f"{run} is finished, after {planned:,} env steps. To train further: sb3-htr train --resume {run} -n STEPS")
             return
-        arguments = [*record["arguments"], "--seed", str(record["seed"]), "-n", str(planned)]
-        check_arguments(arguments, record["gym_packages"], run / RECORD, args.trust)
+        given = [*given_arguments(record["arguments"]), "--seed", str(record["seed"]), "-n", str(planned)]
+        check_arguments(given, record["gym_packages"], run / RECORD, args.trust)
         import_packages(args.gym_packages, record["gym_packages"], run / RECORD, args.trust)
         args.method = record["method"]
         algorithm = get_method(args.method).algorithm
-        # This package may lie elsewhere than the one that began the run; a file that the user gave comes later, and wins
-        if arguments[0] == "--algo" and arguments[2] == "-conf":
-            arguments[3] = algorithm.settings_file
         find_hidden(record["env_id"])
     else:
         if not wants_help and not env:
             raise ValueError("--env is missing: give the id of a task env, as in `sb3-htr train --env SparsePointRobot-v0`.")
-        # Later arguments win, so these are defaults. One thread: two runs on two cores must not fight for them.
-        defaults = ["--algo", algorithm.name, "-conf", algorithm.settings_file, "--num-threads", "1", "--save-freq", "20000"]
         packages = ["--gym-packages", *args.gym_packages] if args.gym_packages else []
         for i, (before, word) in enumerate(pairwise(rest), start=1):
             if before in CONF and Path(word).exists():
                 rest[i] = str(Path(word).resolve())  # wherever the run goes on from
-        arguments = [*defaults, *env, *rest, *packages]
+        given = [*env, *rest, *packages]
         find_hidden(args.env or "")
     keep_freed_memory()
     try:
-        run_rl_zoo(program, algorithm, arguments, args.method, run, args.trust)
+        run_rl_zoo(program, algorithm, [*default_arguments(algorithm), *given], args.method, run, args.trust)
     except (NameError, SyntaxError) as error:
         raise ValueError(
             f"{error}: the values of -params and --env-kwargs are Python, with strings in quotes, as in \"explorer:'prior'\"."

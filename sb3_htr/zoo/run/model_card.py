@@ -8,6 +8,7 @@ from huggingface_hub import EvalResult, ModelCardData
 
 from sb3_htr.adaptation.evaluation import AdaptationRecord
 from sb3_htr.zoo.run.algorithm import Algorithm
+from sb3_htr.zoo.run.arguments import given_arguments
 from sb3_htr.zoo.run.hub import model_name
 from sb3_htr.zoo.run.method import DEFAULT, get_method, methods
 
@@ -35,11 +36,7 @@ def training_command(record: dict[str, Any]) -> str:
     """
     if "arguments" not in record:
         return str(record.get("command", "unknown"))
-    arguments = list(record["arguments"])
-    # What `sb3-htr train` puts in front: --algo, -conf, --num-threads, --save-freq
-    if arguments[:1] == ["--algo"] and arguments[2:3] == ["-conf"]:
-        arguments = arguments[8:]
-    arguments += ["--method", record["method"]]
+    arguments = [*given_arguments(record["arguments"]), "--method", record["method"]]
     words: list[str] = []
     while arguments:
         word = arguments.pop(0)
