@@ -4,11 +4,19 @@
     sb3-htr experiment hidden_target_reacher --gym-packages examples.experiments
     sb3-htr experiment sparse_half_cheetah_velocity --gym-packages examples.experiments
     sb3-htr experiment ant_goal_disc --gym-packages examples.experiments
+    sb3-htr experiment half_cheetah_velocity --gym-packages examples.experiments
 
-All settings are the defaults, but for the ant's entropy coefficient, which is that of SparseAnt-v0.
+All settings are the defaults, but for the ant's entropy coefficient, which is that of SparseAnt-v0, and for
+half_cheetah_velocity, whose rewards are dense: it has PEARL's own.
 """
 
-from examples import ant_goal_disc, hidden_target_reacher, sparse_half_cheetah_velocity, two_link_arm  # noqa: F401 register the envs
+from examples import (  # noqa: F401 register the envs
+    ant_goal_disc,
+    half_cheetah_velocity,
+    hidden_target_reacher,
+    sparse_half_cheetah_velocity,
+    two_link_arm,
+)
 from sb3_htr.experiments.grid import BELIEF, EXPERIMENTS, Experiment, Variant, by
 
 HTR = (Variant("htr-ser"),)
@@ -30,3 +38,15 @@ for name, env_id, n_timesteps, variants in (
         eval_freq=n_timesteps // 4,
         evaluations=by(BELIEF),
     )
+
+# PEARL's own benchmark, by its protocol: the third episode counts
+EXPERIMENTS["half_cheetah_velocity"] = Experiment(
+    "half_cheetah_velocity",
+    "Plain PEARL on one of its own families, whose rewards are dense.",
+    "HalfCheetahVelocity-v0",
+    1_000_000,
+    (Variant("pearl-sparse-prior", "pearl", {"n_envs": 10, **half_cheetah_velocity.SETTINGS}),),
+    eval_freq=100_000,
+    evaluations=by(("prior",)),
+    n_episodes=3,
+)

@@ -4,7 +4,7 @@ import numpy as np
 import torch as th
 
 from sb3_htr.adaptation.loop import adaptation_steps
-from sb3_htr.common.checks import get_task_family
+from sb3_htr.common.checks import get_task_family, missing_hook
 from sb3_htr.common.type_aliases import Context, Trajectory
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.experiments.cell import KwArgs
@@ -27,11 +27,11 @@ def calibration(model: Model, env_id: str, env_kwargs: KwArgs) -> np.ndarray:
     :param env_id: registered env
     :param env_kwargs: arguments of the env
     :return: (N_BINS, 3) float64, of the pairs whose probability is in a bin: how many, sum of probabilities, successes. No
-        pairs for a model without a reward model
+        pairs for a model without a reward model, and for a family without successes
     """
-    if not isinstance(model, PEARL):
-        return np.zeros((N_BINS, 3))
     family = get_task_family(make_task_vec_env(env_id, env_kwargs=env_kwargs))
+    if not isinstance(model, PEARL) or missing_hook(family) is not None:
+        return np.zeros((N_BINS, 3))
     tasks = family.validation_tasks
     env = make_task_vec_env(env_id, len(tasks), seed=0, env_kwargs=env_kwargs)
     env.set_options([{"task": task} for task in tasks])
