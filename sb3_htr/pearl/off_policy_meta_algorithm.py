@@ -149,10 +149,20 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
             super()._setup_model()
             self.replay_buffer = None
         else:
+            self._check_rollouts()
             self._setup_replay(self.env)
             super()._setup_model()
         self.knowledge = LatentKnowledge(self.policy.latent_dim).to(self.device)
         self._introduce_policy()
+
+    def _check_rollouts(self) -> None:
+        n_exploration = getattr(self.train_explorer, "n_exploration_episodes", 0)
+        if 0 < self.n_episodes_per_task <= n_exploration:
+            warnings.warn(
+                f"A rollout has {self.n_episodes_per_task} episodes on a task, and {self.train_explorer.name!r} explores for "
+                f"{n_exploration}: none will act by what was inferred. Raise n_episodes_per_task, or give train_explorer="
+                f"{{'name': {self.train_explorer.name!r}, 'n_exploration_episodes': {self.n_episodes_per_task // 2}}}."
+            )
 
     def _setup_replay(self, env: VecEnv) -> None:
         checks.check_rewards(env)

@@ -318,6 +318,19 @@ def test_an_agent_that_is_not_adapted_warns_once(tiny_pearl: MakePEARL) -> None:
         evaluate_policy(model, env, n_eval_episodes=1)
 
 
+@pytest.mark.parametrize(("n_exploration", "warns"), [(5, True), (3, True), (2, False)])
+def test_rollouts_that_never_act_by_what_they_inferred_are_warned_of(
+    tiny_pearl: MakePEARL, n_exploration: int, warns: bool
+) -> None:
+    explorer = {"name": "learned-prior", "n_exploration_episodes": n_exploration}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        tiny_pearl(n_episodes_per_task=3, train_explorer=explorer)
+        tiny_pearl(n_episodes_per_task=3, explorer=explorer)
+    texts = [str(warning.message) for warning in caught if "none will act by what was inferred" in str(warning.message)]
+    assert len(texts) == warns and all("{'name': 'learned-prior', 'n_exploration_episodes': 1}" in text for text in texts)
+
+
 def test_every_argument_is_documented() -> None:
     for name in inspect.signature(PEARL.__init__).parameters:
         assert name == "self" or f":param {name}:" in (PEARL.__doc__ or ""), name

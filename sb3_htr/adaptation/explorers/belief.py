@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 # z that are compared by their values, those that promise most: fewer change nothing that was measured
 N_COMPARED = 32
-# z is chosen anew so often in an episode, at most
+# z is chosen anew about so often in an episode, once it is known how long one is
 N_CHOICES = 40
 # A value below says nothing about how far a task is
 MIN_VALUE = 1e-3
