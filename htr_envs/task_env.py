@@ -99,7 +99,8 @@ def draw_task_sets(
     train = grid[:n_train_tasks]
     if held_out is not None:
         train = train * (1.0 - (high - low))
-        train = np.where(train < low, train, train + (high - low))
+        # nothing lies beyond an interval that goes to the end
+        train = train if high == 1.0 else np.where(train < low, train, train + (high - low))
 
     def draw(n: int, purpose: int) -> NDArray[np.float64]:
         random_state = np.random.RandomState([task_seed, purpose])

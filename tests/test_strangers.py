@@ -21,6 +21,7 @@ from sb3_htr import load_untrusted
 from sb3_htr.common.checkpoint import MANIFEST, DamagedCheckpoint, read_checkpoint, write_checkpoint
 from sb3_htr.common.resume import checkpoints
 from sb3_htr.zoo.cli import main
+from sb3_htr.zoo.commands.optimize import create_study
 from sb3_htr.zoo.run.agents import RECORD, agent_at
 
 
@@ -52,6 +53,7 @@ RECORDS: dict[str, Callable[[str], dict[str, Any]]] = {
     "an option and its value in one word": lambda code: {"arguments": [f"--hyperparams=gamma:{code}"]},
     "its settings are a module": lambda code: {"arguments": ["-conf", "evil"]},
     "a model to begin with": lambda code: {"arguments": ["-i", "evil.zip"]},
+    "an env within the arguments": lambda code: {"arguments": ["--env-kwargs", "env_id:'evil:Env-v0'"]},
     "an upload": lambda code: {"arguments": ["--track"]},
     "a search": lambda code: {"arguments": ["-optimize"]},
     "packages among the arguments": lambda code: {"arguments": ["--gym-packages", "evil"]},
@@ -88,6 +90,15 @@ def test_records(change: Callable[[str], dict[str, Any]], fuse: Path, tmp_path: 
         assert not fuse.exists(), f"sb3-htr {command[0]} ran it"
 
 
+def test_an_env_within_the_env_of_a_record(fuse: Path, tmp_path: Path, tiny_pearl: MakePEARL) -> None:
+    inner: dict[str, Any] = {"env_id": "HiddenFetchReach-v0", "env_kwargs": {"env_id": "evil:Env-v0"}}
+    run = make_run(tmp_path / "logs", tiny_pearl(), **inner)
+    for command in (["enjoy", str(run), "--no-render"], ["evaluate", str(run)], ["export", str(run)]):
+        with pytest.raises(ValueError, match="has 'evil:Env-v0' among its settings, which can run any code"):
+            main(command)
+    assert not fuse.exists()
+
+
 def test_modules_that_a_record_asks_for_are_imported_if_the_user_names_them(
     fuse: Path, tmp_path: Path, tiny_pearl: MakePEARL
 ) -> None:
@@ -122,6 +133,7 @@ YAMLS: dict[str, Callable[[str], Any]] = {
     "Python as a number": lambda code: {"gamma": code},
     "Python as a schedule": lambda code: {"learning_rate": f"lin_{code}"},
     "Python for the env": lambda code: {"env_kwargs": code},
+    "an env within an env": lambda code: {"env_kwargs": {"env_kwargs": ["evil:Env-v0"]}},
     "a class as text": lambda code: {"policy_kwargs": {"encoder_class": "evil.X"}},
     "deep signs": lambda code: {"policy_kwargs": "-" * 100_000 + "1"},
     "no settings": lambda code: [1, 2],
@@ -137,6 +149,20 @@ def test_yaml_files(change: Callable[[str], Any], fuse: Path, tmp_path: Path) ->
     (tmp_path / "hostile.yml").write_text(yaml.safe_dump({ENV_ID: block}))
     with pytest.raises((ValueError, TypeError)) as refusal:
         main(["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(tmp_path / "hostile.yml")])
+    assert "\n" not in str(refusal.value)
+    assert not fuse.exists()
+
+
+@pytest.mark.parametrize("name", ["policy_kwargs", "env_wrapper", "callback", "net_arch"])
+def test_trials(name: str, fuse: Path, tmp_path: Path) -> None:
+    study = create_study(f"{tmp_path}/study.log", "hostile")
+    study.enqueue_trial({name: code(fuse)})
+    asked = study.ask()
+    asked.suggest_categorical(name, [code(fuse), "evil.X"])
+    study.tell(asked, 1.0)
+    trial = ["--study-name", "hostile", "--storage", f"{tmp_path}/study.log", "--trial-id", "0"]
+    with pytest.raises(ValueError, match=f"has .*{name}") as refusal:
+        main(["train", "--env", ENV_ID, "-f", str(tmp_path), *trial])
     assert "\n" not in str(refusal.value)
     assert not fuse.exists()
 
@@ -172,6 +198,7 @@ MODELS: dict[str, Callable[[dict[str, Any], dict[str, Any]], dict[str, bytes]]] 
             ("policy_kwargs", {"latent_dim": True}),
             ("policy_kwargs", {"encoder_class": "evil.X"}),
             ("policy_kwargs", [1]),
+            ("context_size", 10**8),
             ("explorer", "evil.X"),
             ("explorer", {"name": "evil.X"}),
             ("explorer", {"name": "prior", "n_exploration_episodes": "evil"}),

@@ -42,6 +42,15 @@ class MetaLearner(Protocol):
         ...
 
 
+def own_or_named(model: MetaLearner, name: str) -> str | None:
+    """
+    :param model: may have an explorer of this name, with settings of its own
+    :param name: of an explorer
+    :return: None, which is the model's own, if it is that; else the name
+    """
+    return None if name == model.explorer.name else name
+
+
 class AdaptationRecord(NamedTuple):
     """
     What happened in the adaptation episodes of some tasks.
@@ -128,13 +137,17 @@ def record_adaptation(
     generator = th.Generator().manual_seed(seed)
     env.seed(seed)
     records = []
-    for first in range(0, len(tasks), env.num_envs):
-        # Envs without a task of their own repeat the last one
-        index = np.minimum(np.arange(first, first + env.num_envs), len(tasks) - 1)
-        env.set_options([{"task": task} for task in tasks[index]])
-        adaptation = model.start_adaptation(env.num_envs, explorer, generator)
-        record = run_adaptation(model.policy, env, adaptation, n_episodes, deterministic)
-        records.append([values[: len(tasks) - first] for values in record])
+    # Actions are drawn by torch's global generator
+    with th.random.fork_rng(enabled=not deterministic):
+        if not deterministic:
+            th.manual_seed(seed)
+        for first in range(0, len(tasks), env.num_envs):
+            # Envs without a task of their own repeat the last one
+            index = np.minimum(np.arange(first, first + env.num_envs), len(tasks) - 1)
+            env.set_options([{"task": task} for task in tasks[index]])
+            adaptation = model.start_adaptation(env.num_envs, explorer, generator)
+            record = run_adaptation(model.policy, env, adaptation, n_episodes, deterministic)
+            records.append([values[: len(tasks) - first] for values in record])
     length = max(achieved.shape[2] for _, _, achieved in records)
     for record_ in records:
         padding = ((0, 0), (0, 0), (0, length - record_[2].shape[2]), (0, 0))
@@ -163,7 +176,7 @@ def evaluate_adaptation(
     :param explorer: an :class:`sb3_htr.adaptation.Explorer`, its name, or its name and settings; the model's own by default;
         ``"prior"`` is PEARL's protocol
     :param deterministic: mean actions instead of samples
-    :param seed: seed of env and z; the random state of training is left alone
+    :param seed: seed of env, z and sampled actions; the random state of training is left alone
     :return: returns and successes, (n_tasks, n_episodes) each
     :raises ValueError: if there are no tasks or episodes, or the env has no task family
     """

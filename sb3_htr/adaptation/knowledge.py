@@ -145,8 +145,9 @@ class LatentKnowledge(nn.Module):
         self.task_free_value.copy_(task_free.mean() / max(1 - gamma, 1e-3))
         beside = reward - task_free
         unrewarded = beside[~success].quantile(UNREWARDED) if (~success).any() else th.zeros(())
-        rewarded = beside[success].quantile(REWARDED)
-        self.threshold.copy_((unrewarded + rewarded) / 2)
+        # Of long episodes, the steps that the bank keeps may miss all that were rewarded
+        if success.any():
+            self.threshold.copy_((unrewarded + beside[success].quantile(REWARDED)) / 2)
         return Particles(z, earned / n_rewarded, share * returns[:, None], _log_prior(z, overlap, is_train), is_train)
 
     def set_particles(self, particles: Particles) -> None:

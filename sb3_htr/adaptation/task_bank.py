@@ -153,14 +153,27 @@ class TaskBank:
         arrays = {name: th.tensor(getattr(self, name)) for name in ARRAYS}
         return {**arrays, "random": get_generator_state(self._rng)}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def check(self, state: dict[str, Any]) -> None:
         """
         :param state: of :meth:`state_dict`
-        :raises ValueError: if another version of the package saved it
+        :raises ValueError: if another version of the package saved it, or a model with another ``context_size``
         """
         missing = [name for name in ARRAYS if name not in state]
         if missing:
             raise ValueError(f"What was saved of the task bank has no {missing[0]}: load it with the version that saved it.")
+        _, kept, width = state["episodes"].shape
+        if (kept, width) != self.episodes.shape[1:]:
+            raise ValueError(
+                f"What was saved of the task bank has {kept} steps of {width} numbers from each episode, and this model has "
+                f"{self.episodes.shape[1]} of {self.episodes.shape[2]}: make it with the context_size and env of that one."
+            )
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: of :meth:`state_dict`
+        :raises ValueError: as :meth:`check`
+        """
+        self.check(state)
         for name in ARRAYS:
             setattr(self, name, state[name].cpu().numpy().copy())
         set_generator_state(self._rng, state["random"])

@@ -148,6 +148,13 @@ class CheckpointCallback(BaseCallback):
                 output.writer.close()
                 output.writer = writer
             self._pending = None
+            return
+        beyond = [folder for folder in checkpoints(self.run) if int(folder.name.split("_")[0]) > self.num_timesteps]
+        if beyond:
+            raise ValueError(
+                f"{beyond[0]} is a checkpoint of another training, which went further, and the older checkpoints in a folder "
+                "are removed: give another save_path, or go on with that training."
+            )
 
     def _tensorboards(self) -> list[TensorBoardOutputFormat]:
         return [output for output in self.logger.output_formats if isinstance(output, TensorBoardOutputFormat)]

@@ -1,5 +1,6 @@
 """One run of an experiment: what is trained, and how the final model is evaluated."""
 
+import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,6 +79,13 @@ class Cell:
         :return: file of its raw results
         """
         return runs / self.experiment / f"{self.name}.npz"
+
+    def facts(self) -> str:
+        """
+        :return: what its numbers are of, as JSON
+        """
+        names = ("env_id", "env_kwargs", "method", "settings", "seed", "n_timesteps", "n_episodes")
+        return json.dumps({name: getattr(self, name) for name in names}, sort_keys=True)
 
     def training(self, folder: Path) -> list[str]:
         """

@@ -3,7 +3,7 @@
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from itertools import takewhile
+from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from sb3_htr.experiments.protocol import evaluate
 from sb3_htr.zoo.commands import train
 from sb3_htr.zoo.run.agents import RECORD, agent_at, file_stem, find_runs, read_record
 from sb3_htr.zoo.run.algorithm import Model
+from sb3_htr.zoo.run.arguments import ALWAYS
 from sb3_htr.zoo.run.solved import seconds_at
 from sb3_htr.zoo.run.trust import import_packages
 
@@ -58,7 +59,9 @@ def run_cell(cell: Cell, runs: Path) -> bool:
         path.mkdir(parents=True, exist_ok=True)
     try:
         with claim(cell, runs).acquire(timeout=0):
-            if not result.exists():
+            if result.exists():
+                _check_facts(cell, result)
+            else:
                 with _logged(folder / "log.txt"):
                     arrays = _train_and_evaluate(cell, folder)
                 with atomic_path(result) as path:
@@ -88,6 +91,7 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
         "curve": evaluations["results"],
         "solved": evaluations["successes"][..., -1],
         "elapsed_s": seconds_at(run / "progress.csv", evaluations["timesteps"]),
+        "cell": cell.facts(),
         # Of the code as it was when the training began, and as it is now
         "commit": named(read_record(run / RECORD)),
         "evaluation_commit": named(commit()),
@@ -110,7 +114,7 @@ def find_finished(cell: Cell, folder: Path) -> tuple[Path, Model] | None:
                     f"{run} has {key} {record[key]!r}, but {cell.experiment}/{cell.name} needs {getattr(cell, key)!r}: "
                     f"move this run away, or choose other --runs."
                 )
-        has, needs = (_params(arguments) for arguments in (record["arguments"], cell.training(folder)))
+        has, needs = (_settings(arguments) for arguments in (record["arguments"], cell.training(folder)))
         if has != needs:
             raise ValueError(
                 f"{run} has the settings {sorted(has)}, but {cell.experiment}/{cell.name} needs {sorted(needs)}: move this "
@@ -124,10 +128,21 @@ def find_finished(cell: Cell, folder: Path) -> tuple[Path, Model] | None:
     return None
 
 
-def _params(arguments: list[str]) -> set[str]:
-    """Hyperparameters among the arguments of a training."""
+def _settings(arguments: list[str]) -> set[str]:
+    """Of the arguments of a training, hyperparameters and the number of adaptation episodes."""
     after = arguments[arguments.index("-params") + 1 :] if "-params" in arguments else []
-    return set(takewhile(lambda word: not word.startswith("-"), after))
+    options = {**ALWAYS, **{option: value for option, value in pairwise(arguments) if option in ALWAYS}}
+    return {*takewhile(lambda word: not word.startswith("-"), after), f"--eval-episodes {options['--eval-episodes']}"}
+
+
+def _check_facts(cell: Cell, result: Path) -> None:
+    """Results of older versions do not say what they are of."""
+    raw = np.load(result)
+    if "cell" in raw and raw["cell"] != cell.facts():
+        raise ValueError(
+            f"{result} is of {raw['cell']}, but {cell.experiment}/{cell.name} is {cell.facts()}: move it away with its run, "
+            "or choose other --runs."
+        )
 
 
 @contextmanager

@@ -58,7 +58,8 @@ class MultiTaskReplayBuffer(ReplayBuffer):
     episode reached. (Algorithm 2, line 12 of the paper has the comparison with K inverted; A.2 and B.3 call K the probability
     of relabelling, which is what it is here.)
 
-    :param buffer_size: capacity in transitions, shared equally by all training tasks
+    :param buffer_size: capacity in transitions, shared equally by all training tasks, and counted in episodes of
+        ``max_episode_steps``: of shorter ones there are as many, with fewer transitions
     :param observation_space: Box
     :param action_space: Box
     :param device: where samples are put
@@ -133,7 +134,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         self.relabeller.bind(self)
         # Told of every finished episode: the training task that it was collected on, and its transitions
         self.episode_listeners: list[Callable[[int, np.ndarray], None]] = []
-        if self.tells_rewards:
+        if self.tells_rewards and relabel_probability > 0:
             self.episode_listeners.append(self.relabeller.on_episode)
 
     def seed(self, seed: int | None) -> None:
@@ -313,8 +314,9 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         :raises ValueError: if it is of another task family, or of a store of other sizes
         """
         check_same_family(state["task_family"], family_facts(self.task_family), "This model's env")
-        self.episodes.load_state_dict(state["episodes"])
+        # First, as it may lack what another relabeller saved
         self.relabeller.load_state_dict(state["relabeller"])
+        self.episodes.load_state_dict(state["episodes"])
         for generator, saved in zip((self._rng, self.relabel_rng), state["random"], strict=True):
             set_generator_state(generator, saved)
         self.discard_open_episodes()

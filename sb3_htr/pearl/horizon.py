@@ -32,7 +32,8 @@ def settings_for(max_episode_steps: int, n_tasks_per_rollout: int) -> dict[str, 
     return {
         "gamma": min(max(1 - 2 / max_episode_steps, 0.0), MAX_GAMMA),
         "n_episodes_per_task": n_episodes,
-        "learning_starts": rollout,
+        # SB3 learns beyond so many steps, and this is after the first rollout
+        "learning_starts": rollout - 1,
         "gradient_steps": max(rollout // STEPS_PER_UPDATE, 1),
         "batch_size": n_transitions,
         "context_size": n_transitions,

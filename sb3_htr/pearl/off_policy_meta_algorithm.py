@@ -449,6 +449,8 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
             if task is None:
                 vec_env.reset()
                 task = np.array(vec_env.get_attr("task")[0])
+            if np.ndim(task) == 0 and not np.issubdtype(np.asarray(task).dtype, np.integer):
+                raise ValueError(f"task is {task!r}: pass the index of a training task, or a task as a vector, [{task!r}].")
             vec_env.set_options({"task_id": int(task)} if np.ndim(task) == 0 else {"task": np.asarray(task, dtype=np.float32)})
         elif task is not None:
             raise ValueError("The env has no task family, so it takes no task: leave task out, and set its task yourself.")
@@ -529,6 +531,7 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
             raise ValueError(
                 f"{path} is damaged, or no replay buffer of sb3_htr: pass a file that save_replay_buffer has written."
             ) from None
+        own_task_bank.check(task_bank)
         try:
             own_replay.load_state_dict(replay)
         except KeyError as missing:

@@ -19,6 +19,8 @@ from sb3_htr.pearl.policies import PEARLPolicy
 
 # How large networks may be
 MAX_LAYERS, MAX_UNITS = 16, 2**14
+# How many steps of an episode the bank of tasks may keep
+MAX_CONTEXT = 2**14
 EXPLORERS = ("explorer", "train_explorer")
 # Of an object, SB3 writes its plain attributes beside its type and its pickle
 TYPE, PICKLED = ":type:", ":serialized:"
@@ -28,7 +30,7 @@ NUMBERS = (
     *("target_update_interval", "meta_batch_size", "context_size", "kl_coef", "reward_coef"),
     *("n_tasks_per_rollout", "n_episodes_per_task"),
 )
-WORDS = {"ent_coef": r"auto(_\d+(\.\d+)?)?", "target_entropy": "auto", "matmul_precision": "highest|high|medium"}
+WORDS = {"ent_coef": r"auto(_(?=.*[1-9])\d+(\.\d+)?)?", "target_entropy": "auto", "matmul_precision": "highest|high|medium"}
 COUNTERS = ("num_timesteps", "_n_updates")
 # Arguments of the replay buffer that are plain data
 REPLAY = ("relabel_probability", "relabeller", "rl_reward_type", "context_episodes")
@@ -61,6 +63,8 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
         replay = data.get("replay_buffer_kwargs")
         replay = replay if isinstance(replay, dict) else {}
         settings["replay_buffer_kwargs"] = {name: replay[name] for name in REPLAY if name in replay and PICKLED not in replay}
+        if settings.get("context_size", 0) > MAX_CONTEXT:
+            raise ValueError(f"PEARL has no contexts of {settings['context_size']} steps here.")
         counters = {name: data[name] for name in COUNTERS if type(data.get(name)) is int}
         settings["policy_kwargs"] = _policy_kwargs(data.get("policy_kwargs", {}))
     except Exception as error:  # whatever a stranger can put into a file

@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from helpers import ENV_ID, PRIOR, ROLLOUT, MakePEARL
@@ -181,3 +182,14 @@ def test_adapt_keeps_one_task_when_the_env_has_none(tiny_pearl: MakePEARL) -> No
 def test_bad_requests(tiny_pearl: MakePEARL, call: Callable[[PEARL], Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         call(tiny_pearl())
+
+
+def test_sampled_actions_leave_the_random_state_of_training_alone(tiny_pearl: MakePEARL) -> None:
+    model, results = tiny_pearl().learn(240), []
+    for seed in (3, 3, 4):
+        before = th.get_rng_state()
+        returns, _ = evaluate_adaptation(model, ENV_ID, n_episodes=2, explorer="prior", deterministic=False, seed=seed)
+        results.append(returns)
+        assert (th.get_rng_state() == before).all()
+        th.randn(3)
+    assert (results[0] == results[1]).all()

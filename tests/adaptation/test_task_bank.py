@@ -230,3 +230,14 @@ def test_particles_of_a_loaded_model_are_not_replaced_by_fewer(tiny_pearl: MakeP
         loaded.learn(ROLLOUT)
         assert 1 < len(loaded.task_bank.solved().lengths) < 384  # type: ignore[union-attr]
         assert (int(loaded.knowledge.n_particles) == n) == kept
+
+
+def test_a_threshold_waits_for_a_success_that_the_bank_has_kept(tiny_pearl: MakePEARL) -> None:
+    """Of a long episode, the steps that are kept may miss the one that was rewarded."""
+    model = tiny_pearl().learn(ROLLOUT)
+    bank, before = model.task_bank, model.knowledge.threshold.clone()
+    assert bank is not None
+    solved = bank.solved
+    bank.solved = lambda: solved()._replace(success=np.zeros_like(solved().success))  # type: ignore[method-assign]
+    model.learn(ROLLOUT, reset_num_timesteps=False)
+    assert model.knowledge.threshold == before

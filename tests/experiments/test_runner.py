@@ -108,6 +108,22 @@ def test_the_command_repeats_an_experiment(
     assert plain.load().explorer.name == "prior"
 
 
+def test_results_of_other_settings_are_not_taken_for_those_of_a_cell(tmp_path: Path) -> None:
+    variant = Variant("htr-ser", "tiny", SMALL, {"n_test_tasks": 4})
+    (cell,) = Experiment("one", "", ENV_ID, 480, (variant,), 1, 480, by(("prior",)), n_episodes=2).cells()
+    assert run_cell(cell, tmp_path)
+    for other in (
+        replace(cell, settings={**SMALL, "gamma": 0.5}),
+        replace(cell, n_timesteps=960),
+        replace(cell, n_episodes=3),
+    ):
+        with pytest.raises(ValueError, match="move it away with its run"):
+            run_cell(other, tmp_path)
+    cell.result(tmp_path).unlink()
+    with pytest.raises(ValueError, match=r"has the settings .*'--eval-episodes 2'.* needs .*'--eval-episodes 3'"):
+        find_finished(replace(cell, n_episodes=3), cell.run_folder(tmp_path))
+
+
 def test_explorers_and_episodes_are_those_of_the_experiment(tmp_path: Path) -> None:
     """Of the training, its evaluations, and the final model's."""
     explorer = {"name": "prior", "n_exploration_episodes": 2}

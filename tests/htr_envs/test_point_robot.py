@@ -118,6 +118,13 @@ def test_a_sector_can_be_held_out_of_training(sector: tuple[float, float]) -> No
         assert (inside > low - 1e-5).all() and (inside < high + 1e-5).all() and np.ptp(inside) > 0.8 * (high - low)
 
 
+@pytest.mark.parametrize("task_seed", range(4))
+def test_no_training_task_is_at_the_end_of_a_sector_that_goes_to_the_end(task_seed: int) -> None:
+    for sector in ((140.0, 180.0), (0.0, 40.0)):
+        train = 180 * parts_of_the_semicircle(PointRobotFamily(held_out=sector, task_seed=task_seed).train_tasks)
+        assert (train < 140 + 1e-3).all() if sector[1] == 180 else (train > 40 - 1e-3).all()
+
+
 def test_dynamics_are_clipped_steps_that_stay_in_the_arena() -> None:
     env = PointRobotEnv()
     observation, _ = env.reset()

@@ -185,9 +185,12 @@ def test_flipped_bits_are_noticed_or_harmless(tiny_pearl: MakePEARL, tmp_path: P
 def test_a_replay_buffer_of_other_settings_is_refused(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
     tiny_pearl().learn(ROLLOUT).save_replay_buffer(tmp_path / "buffer")
     with pytest.raises(ValueError, match="make the model with the relabeller that it was saved with"):
-        tiny_pearl(replay_buffer_kwargs={"relabeller": "EpisodeClustering"}).load_replay_buffer(tmp_path / "buffer")
+        (model := tiny_pearl(replay_buffer_kwargs={"relabeller": "EpisodeClustering"})).load_replay_buffer(tmp_path / "buffer")
+    assert model.replay_buffer is not None and model.replay_buffer.size() == 0, "nothing was loaded"
     with pytest.raises(ValueError, match="use the settings that they were saved with"):
         tiny_pearl(buffer_size=10_000).load_replay_buffer(tmp_path / "buffer")
+    with pytest.raises(ValueError, match=r"task bank has 20 steps of 9 numbers .* this model has 7 of 9"):
+        tiny_pearl(context_size=7).load_replay_buffer(tmp_path / "buffer")
     with pytest.raises(ValueError, match="pass env="):
         PEARL("MlpPolicy", None, _init_setup_model=False).load_replay_buffer(tmp_path / "buffer")
     with pytest.raises(ValueError, match="no env, so it has no replay buffer"):

@@ -20,11 +20,11 @@ def make(max_episode_steps: int, **given: Any) -> PEARL:
 @pytest.mark.parametrize(
     ("max_episode_steps", "expected"),
     [
-        (1, (0.0, 10, 200, 10, 1, 1)),
-        (20, (0.9, 10, 4000, 200, 20, 20)),
-        (50, (0.96, 8, 8000, 400, 24, 24)),
-        (200, (0.98, 2, 8000, 400, 24, 24)),
-        (1000, (0.98, 2, 40_000, 2000, 24, 24)),
+        (1, (0.0, 10, 199, 10, 1, 1)),
+        (20, (0.9, 10, 3999, 200, 20, 20)),
+        (50, (0.96, 8, 7999, 400, 24, 24)),
+        (200, (0.98, 2, 7999, 400, 24, 24)),
+        (1000, (0.98, 2, 39_999, 2000, 24, 24)),
     ],
 )
 def test_what_is_not_given_follows_from_the_time_limit(max_episode_steps: int, expected: tuple[float, ...]) -> None:
@@ -46,6 +46,14 @@ def test_a_rollout_has_as_many_updates_per_step_at_any_time_limit() -> None:
         steps = 20 * settings["n_episodes_per_task"] * max_episode_steps
         assert steps / settings["gradient_steps"] == pytest.approx(20, rel=0.05)
         assert timesteps_for(max_episode_steps) >= 10 * steps, "a training has many rollouts"
+
+
+def test_updates_follow_the_first_rollout_by_default() -> None:
+    model = PEARL(
+        "MlpPolicy", ENV_ID, **{key: TINY[key] for key in ("n_tasks_per_rollout", "gradient_steps", "policy_kwargs")}
+    )
+    rollout = 4 * 10 * 20
+    assert model.learn(1).num_timesteps == rollout and model._n_updates == TINY["gradient_steps"]
 
 
 def test_a_loaded_model_keeps_its_own(tmp_path: Any) -> None:

@@ -3,7 +3,7 @@
 import inspect
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -329,6 +329,17 @@ def test_rollouts_that_never_act_by_what_they_inferred_are_warned_of(
         tiny_pearl(n_episodes_per_task=3, explorer=explorer)
     texts = [str(warning.message) for warning in caught if "none will act by what was inferred" in str(warning.message)]
     assert len(texts) == warns and all("{'name': 'learned-prior', 'n_exploration_episodes': 1}" in text for text in texts)
+
+
+def test_a_scalar_that_is_no_index_is_no_task(tiny_pearl: MakePEARL) -> None:
+    """Where a task is one number, it is natural to write it so."""
+    model = tiny_pearl("SparseTargetSpeed-v0")
+    scalars: list[Any] = [2.7, np.float32(1.9)]
+    for task in scalars:
+        with pytest.raises(ValueError, match=r"pass the index of a training task, or a task as a vector"):
+            model.adapt("SparseTargetSpeed-v0", n_episodes=1, task=task)
+    with pytest.warns(UserWarning, match="No reward was found"):
+        model.adapt("SparseTargetSpeed-v0", n_episodes=1, task=cast(Any, np.int64(3)))
 
 
 def test_every_argument_is_documented() -> None:

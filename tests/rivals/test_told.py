@@ -94,6 +94,20 @@ def test_another_env_brings_its_task_family_unless_there_is_experience() -> None
     assert model.learn(80).num_timesteps == 80
 
 
+def test_training_is_on_training_tasks_after_an_evaluation_in_the_same_env() -> None:
+    env = make_task_vec_env(ENV_ID, 4, seed=0)
+    model = tiny_sac_her(env).learn(80)
+    evaluate_adaptation(model, env, n_episodes=1)
+    seen: set[int] = set()
+
+    def look(local: dict[str, Any], _: Any) -> bool:
+        seen.update(info["task_id"] for info in local["infos"])
+        return True
+
+    model.learn(160, look)
+    assert len(seen) > 1 and -1 not in seen
+
+
 @pytest.mark.parametrize(("log_interval", "n_logs"), [(1, 4), (2, 2), (None, 0)])
 def test_logs_are_so_many_rollouts_apart(log_interval: Any, n_logs: int, monkeypatch: pytest.MonkeyPatch) -> None:
     model, logs = tiny_sac_her(), list[int]()

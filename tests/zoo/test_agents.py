@@ -18,6 +18,8 @@ from helpers import ENV_ID, MakePEARL, with_policy
 from helpers.runs import NOWHERE, SHIPPED, make_run, run_folder
 from sb3_htr import PEARL, load_untrusted
 from sb3_htr.adaptation.evaluation import AdaptationRecord, record_adaptation
+from sb3_htr.common.checks import get_task_family
+from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.zoo import cli
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run import model_card
@@ -115,6 +117,28 @@ def test_a_model_of_another_version_is_said_to_be_one(tmp_path: Path, tiny_pearl
         main(["enjoy", str(tmp_path / "mixed.zip"), "--no-render"])
     with pytest.raises(ValueError, match=r"mixed.zip has other networks than this version makes \(it is of sb3_htr 0.1.0\)"):
         main(["enjoy", str(tmp_path / "mixed.zip"), "--no-render", "--trust"])
+
+
+def test_an_exported_agent_is_exported_again_in_place(
+    tmp_path: Path, tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the scores of its own explorer: one episode of its prior, in place of five."""
+    monkeypatch.chdir(tmp_path)
+    explorer = {"name": "prior", "n_exploration_episodes": 1}
+    make_run(tmp_path / "logs", tiny_pearl(explorer=explorer).learn(480))
+    export = ["export", "--n-episodes", "3"]
+    assert main([*export, "logs"]) == 0
+    folder = tmp_path / "exported" / ENV_ID
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    model = agent_at(folder).load()
+    assert isinstance(model, PEARL) and getattr(model.explorer, "n_exploration_episodes", 0) == 1
+    assert main([*export, str(folder)]) == 0
+    assert {path.name: path.read_bytes() for path in folder.iterdir()}.keys() == before.keys()
+    env = make_task_vec_env(ENV_ID, 20)
+    returns = record_adaptation(model, env, get_task_family(env).test_tasks, 3).returns
+    assert f"{returns[:, -1].mean():.2f}" in (folder / "README.md").read_text()
+    assert main(["evaluate", str(folder), "--n-episodes", "3", "-o", str(tmp_path)]) == 0
+    np.testing.assert_allclose(np.load(tmp_path / "adaptation.npz")["returns"], returns, atol=1e-5)
 
 
 def test_normalized_agents_are_exported_with_their_statistics(tmp_path: Path, tiny_pearl: MakePEARL) -> None:

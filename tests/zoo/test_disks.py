@@ -10,7 +10,7 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import load_results
 
-from helpers import ENV_ID, TINY, MakePEARL
+from helpers import ENV_ID, ROLLOUT, TINY, MakePEARL
 from helpers import parameters as parameters_of
 from helpers.disks import disk
 from helpers.runs import run_folder, train_arguments
@@ -129,3 +129,15 @@ def test_a_wrong_clock_ends_no_training(seconds: float, tmp_path: Path, monkeypa
     assert [folder.name for folder in checkpoints(run)] == ["480_steps", "240_steps"]
     assert main(["train", "--resume", str(run)]) == 0
     assert PEARL.load(run / f"{ENV_ID}.zip").num_timesteps == 480
+
+
+def test_checkpoints_of_a_training_that_went_further_are_not_removed(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    """Of a script that was started anew with the same folder; a training may itself go on."""
+    model = tiny_pearl()
+    for n, again in ((2 * ROLLOUT, True), (ROLLOUT, False)):
+        model.learn(n, CheckpointCallback(1, str(tmp_path)), reset_num_timesteps=again)
+    kept = checkpoints(tmp_path)
+    assert kept[0].name == f"{3 * ROLLOUT}_steps"
+    with pytest.raises(ValueError, match=rf"{3 * ROLLOUT}_steps is a checkpoint of another training, which went further"):
+        tiny_pearl().learn(ROLLOUT, CheckpointCallback(1, str(tmp_path)))
+    assert checkpoints(tmp_path) == kept

@@ -185,6 +185,18 @@ def test_a_run_goes_on_where_the_package_lies_elsewhere(unbroken: Path, tmp_path
     assert_same_run(run, unbroken)
 
 
+def test_other_settings_are_refused_again_and_again(unbroken: Path, tmp_path: Path) -> None:
+    run = cut_off(unbroken, tmp_path)
+    record = json.loads((run / "run.json").read_text())
+    # As if the YAML file had been changed since
+    record["hyperparams"]["gamma"] = 0.123
+    (run / "run.json").write_text(json.dumps(record))
+    for _ in range(2):
+        with pytest.raises(ValueError, match=r"The hyperparameters \['gamma', 'n_timesteps'\] have changed"):
+            main(["train", "--resume", str(run), "-n", "240"])
+        assert json.loads((run / "run.json").read_text()) == record
+
+
 def test_the_last_one_cleans_up(unbroken: Path, tmp_path: Path) -> None:
     """Killed after the last checkpoint was written and before older ones were removed, and while writing one."""
     run = cut_off(unbroken, tmp_path)

@@ -10,7 +10,7 @@ from typing import Any
 from htr_envs.goal_env import find_hidden
 from sb3_htr.adaptation.explorers import EXPLORERS
 from sb3_htr.zoo.run.agents import TrainedAgent, agent_at, agent_for
-from sb3_htr.zoo.run.trust import import_packages, refuse
+from sb3_htr.zoo.run.trust import check_env_kwargs, import_packages, refuse
 
 TASK_SETS = ("test", "validation", "train")
 OF_PACKAGES = "modules of your own that register envs, methods or experiments"
@@ -112,6 +112,7 @@ def chosen_agent(parser: argparse.ArgumentParser, args: argparse.Namespace, path
     if ":" in agent.env_id and not args.trust:
         raise refuse(agent.path, f"is for the env {agent.env_id!r}")
     import_packages(args.gym_packages, agent.record["gym_packages"], agent.path, args.trust)
+    check_env_kwargs(agent.record["env_kwargs"], agent.path, args.trust, args.gym_packages)
     find_hidden(agent.env_id)
     kwargs = {**agent.record["env_kwargs"], **args.env_kwargs}
     return dataclasses.replace(agent, record={**agent.record, "env_kwargs": kwargs})

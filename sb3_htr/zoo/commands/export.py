@@ -9,7 +9,7 @@ from typing import Any
 
 from stable_baselines3 import SAC
 
-from sb3_htr.adaptation.evaluation import record_adaptation
+from sb3_htr.adaptation.evaluation import own_or_named, record_adaptation
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checks import get_task_family, keywords_of
 from sb3_htr.zoo.commands.arguments import add_agent_arguments, make_parser, parse
@@ -64,20 +64,18 @@ def export(agent: TrainedAgent, path: Path, trust: bool = False) -> dict[str, An
     return record
 
 
-def make_room(folder: Path, names: Sequence[str]) -> None:
+def earlier_export(folder: Path, names: Sequence[str]) -> list[Path]:
     """
-    Take away what an earlier export has left, so that the folder holds one model only.
-
     :param folder: to write to
     :param names: of what an export writes
-    :raises ValueError: if there is anything else in it
+    :return: what an earlier export has left there
+    :raises ValueError: if there is anything else in it, as a folder holds one model only
     """
     found = [path.name for path in folder.iterdir() if not path.name.startswith(".")] if folder.is_dir() else []
     others = sorted(set(found) - set(names))
     if others:
         raise ValueError(f"{folder} holds other files, such as {others[0]}: give a folder of its own, with -o.")
-    for name in found:
-        (folder / name).unlink()
+    return [folder / name for name in found]
 
 
 def main(argv: Sequence[str]) -> None:
@@ -96,10 +94,13 @@ def main(argv: Sequence[str]) -> None:
     if alone and (args.push_to_hub or args.film):
         raise ValueError(f"--push-to-hub and --film need a folder, but the output is the file {output}.")
     name = model_name(agent.env_id, agent.algorithm.name)
-    if not alone:
-        make_room(output, files(name))
+    left = [] if alone else earlier_export(output, files(name))
     file = output if alone else output / f"{name}.zip"
     record = export(agent, file, args.trust)
+    # Not before the model is written: it may be the one that is exported
+    for path in left:
+        if path != file:
+            path.unlink()
     print(f"{file}: {file.stat().st_size / 1e6:.2f} MB, of {agent.path}")
     if alone:
         return
@@ -107,7 +108,9 @@ def main(argv: Sequence[str]) -> None:
     model, env = exported.load(trust=args.trust), exported.make_vec_env(20)
     tasks = get_task_family(env).test_tasks
     explorers = dict.fromkeys([model.explorer.name, *exported.algorithm.also_explores_by])
-    scores = {explorer: record_adaptation(model, env, tasks, args.n_episodes, explorer=explorer) for explorer in explorers}
+    scores = {
+        name: record_adaptation(model, env, tasks, args.n_episodes, explorer=own_or_named(model, name)) for name in explorers
+    }
     repo_id = args.push_to_hub
     if repo_id is not None and "/" not in repo_id:
         repo_id += f"/{name}"

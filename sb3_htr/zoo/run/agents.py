@@ -24,6 +24,8 @@ from sb3_htr.zoo.run.shipped import shipped
 RECORD = "run.json"
 # What it must say, and what it may say for training on and for model cards
 REQUIRED = {"env_id": str, "env_kwargs": dict, "gym_packages": list}
+# Bytes of a record
+MAX_RECORD = 2**20
 OF_TRAINING = {"arguments": list, "n_timesteps": int, "seed": int, "method": str, "hyperparams": dict}
 
 
@@ -203,6 +205,8 @@ def agent_at(path: str | os.PathLike[str], which: str = "best", env_id: str | No
     names: list[str] = []
     with contextlib.suppress(zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
         names = archive.namelist()
+        if RECORD in names and archive.getinfo(RECORD).file_size > MAX_RECORD:
+            raise ValueError(f"The {RECORD} in {path} unpacks to more than {MAX_RECORD} bytes, which no training writes.")
         if RECORD in names:
             return TrainedAgent(path, read_record(path, archive.read(RECORD)), None)
     if "data" not in names:

@@ -95,7 +95,7 @@ class MetaExperimentManager(ExperimentManager):
         if self.resumed is not None:  # what a user gave comes from a file now
             given = plain_settings(given, self.resumed / RECORD, self.trust)
         self._given = names_of(given)
-        hyperparams = merged(merged(hyperparams, self._trial(trial_id)), given)
+        hyperparams = merged(merged(hyperparams, plain_settings(self._trial(trial_id), self.storage, self.trust)), given)
         saved = OrderedDict(sorted(hyperparams.items()))
         print(f"Method {self.method.name}: {self.config} has the settings of the env. With those of the command line:")
         pprint(dict(saved))
@@ -269,15 +269,15 @@ class MetaExperimentManager(ExperimentManager):
         if self.resumed is not None:
             record = read_record(self.resumed / RECORD)
             before, now = record["hyperparams"], json.loads(json.dumps(used))
-            if before["n_timesteps"] < now["n_timesteps"]:
-                self._write_record({**record, "n_timesteps": self.n_timesteps, "arguments": sys.argv[1:], "hyperparams": now})
-                before = {**before, "n_timesteps": now["n_timesteps"]}
-            if before != now:
-                changed = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
+            is_longer = before["n_timesteps"] < now["n_timesteps"]
+            changed = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
+            if changed and not (is_longer and changed == ["n_timesteps"]):
                 raise ValueError(
                     f"The hyperparameters {changed} have changed since {self.resumed} was begun: a run goes on with the "
                     "settings that it has. Restore the YAML file, or begin a new run."
                 )
+            if is_longer:
+                self._write_record({**record, "n_timesteps": self.n_timesteps, "arguments": sys.argv[1:], "hyperparams": now})
             return
         super()._save_config(saved_hyperparams)
         run = {

@@ -72,13 +72,15 @@ def convert_pearl_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
             converted[_argument(name)] = 2**value
         elif name == "latent_dim":
             policy[name] = value
-        elif name in ARCHS:
+        elif name in ARCHS and value in ARCHS[name]:
             policy[name] = ARCHS[name][value]
         elif name == "relabel_probability":
             replay[name] = value
         elif name == "hindsight_task_strategy":
             replay["relabeller"] = {name: value}
-        else:
+        elif name in FLOATS:
             converted[name] = value
+        else:
+            raise ValueError(f"The trial has {name} {value!r}, which sb3-htr optimize does not try: it is of another program.")
     nested = {"policy_kwargs": policy, "replay_buffer_kwargs": replay}
     return {**converted, **{name: kwargs for name, kwargs in nested.items() if kwargs}}

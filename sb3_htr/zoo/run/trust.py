@@ -51,6 +51,7 @@ def plain_settings(hyperparams: dict[str, Any], file: object, trust: bool) -> di
     for key in IMPORTED:
         if hyperparams.get(key) is not None:
             raise refuse(file, f"has {key}: {hyperparams[key]!r}")
+    check_env_kwargs(hyperparams.get("env_kwargs"), file, trust)
     if "." in str(hyperparams.get("policy", "")):
         raise refuse(file, f"has policy: {hyperparams['policy']!r}")
     for key in EVALUATED:
@@ -75,13 +76,35 @@ def check_arguments(arguments: Sequence[str], packages: Sequence[str], file: obj
             option = word
             refused = word not in HARMLESS
         elif option in KEY_VALUES:
-            refused = not _is_literal(word.partition(":")[2])
+            key, _, value = word.partition(":")
+            refused = not _is_literal(value)
+            if not refused:
+                check_env_kwargs({key: ast.literal_eval(value)}, file, trust)
         else:
             refused = (option in CONF and Path(word).suffix not in (".yml", ".yaml")) or (
                 option == "--gym-packages" and word not in packages
             )
         if refused:
             raise refuse(file, f"has the argument {word!r}")
+
+
+def check_env_kwargs(env_kwargs: Any, file: object, trust: bool, named: Iterable[str] = ()) -> None:
+    """
+    :param env_kwargs: of a file. A text ``module:id``, with dots and underscores, is an env whose module would be imported
+    :param file: for messages
+    :param trust: whether it may have code run
+    :param named: modules that the user has named
+    :raises ValueError: if code would be run
+    """
+    if isinstance(env_kwargs, dict):
+        env_kwargs = [*env_kwargs.values()]
+    if isinstance(env_kwargs, list | tuple):
+        for value in env_kwargs:
+            check_env_kwargs(value, file, trust, named)
+    elif isinstance(env_kwargs, str) and not trust:
+        module, colon, _ = env_kwargs.rpartition(":")
+        if colon and module not in (*PACKAGES, *named):
+            raise refuse(file, f"has {env_kwargs!r} among its settings")
 
 
 def _one_by_one(arguments: Sequence[str]) -> Iterator[str]:
