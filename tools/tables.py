@@ -19,14 +19,18 @@ COLUMNS = {
     "success_rate": "tasks solved in it",
     "episodes_to_first_success": "episodes to the first success",
 }
+# Experiments whose families tell no successes
+DENSE = ("half_cheetah_velocity",)
 
 
-def columns(n_episodes: int) -> list[str]:
+def columns(summary: dict[str, Any]) -> dict[str, str]:
     """
-    :param n_episodes: of an adaptation
-    :return: heads of the columns of scores
+    :param summary: content of a ``summary.json``
+    :return: metrics and heads of the columns of scores
     """
-    return [head.format(n_episodes=n_episodes) for head in COLUMNS.values()]
+    n_episodes = summary["rows"][0].get("n_episodes", 20)
+    shown = ("last_episode_return",) if summary["name"] in DENSE else (*COLUMNS,)
+    return {metric: COLUMNS[metric].format(n_episodes=n_episodes) for metric in shown}
 
 
 def table(summary: dict[str, Any]) -> str:
@@ -43,8 +47,9 @@ def table(summary: dict[str, Any]) -> str:
         key = (*(str(row["env_kwargs"][setting]) for setting in settings), row["variant"], f"`{row['explorer']}`", *place)
         lines.setdefault(key, {})[row["metric"]] = f"{row['iqm']:.2f} [{row['low']:.2f}, {row['high']:.2f}]"
     settings = [setting.replace("_", " ") for setting in settings]
-    head = [*settings, "method", "explorer", *["tested on"] * has_places, *columns(rows[0].get("n_episodes", 20))]
-    body = [[*key, *(cells[metric] for metric in COLUMNS)] for key, cells in lines.items()]
+    shown = columns(summary)
+    head = [*settings, "method", "explorer", *["tested on"] * has_places, *shown.values()]
+    body = [[*key, *(cells[metric] for metric in shown)] for key, cells in lines.items()]
     env_steps = " / ".join(f"{n:,}" for n in sorted({row["env_steps"] for row in rows}))
     about = f"{rows[0]['env']}, {env_steps} env steps, {_runs(rows)}."
     later = summary.get("evaluation_commit", summary["commit"])
@@ -78,7 +83,8 @@ def headline(summaries: dict[str, dict[str, Any]]) -> str:
     :param summaries: contents of ``summary.json`` by their names, those of ``ENVS`` among them where they are there
     :return: Markdown table, one line per env, method and explorer
     """
-    lines = [["env", "env steps", "seeds", "method", "explorer", *columns(20)]]
+    shown = {metric: head.format(n_episodes=20) for metric, head in COLUMNS.items()}
+    lines = [["env", "env steps", "seeds", "method", "explorer", *shown.values()]]
     lines.append(["---"] * len(lines[0]))
     for summary in (summaries[name] for name in ENVS if name in summaries):
         scores: dict[tuple[str, ...], dict[str, str]] = {}
@@ -86,7 +92,7 @@ def headline(summaries: dict[str, dict[str, Any]]) -> str:
             if row["variant"] in METHODS and row["explorer"] in EXPLORERS and not row.get("tested_on"):
                 key = (row["env"], f"{row['env_steps']:,}", str(row["n_seeds"]), row["variant"], f"`{row['explorer']}`")
                 scores.setdefault(key, {})[row["metric"]] = _interval(row)
-        lines += [[*key, *(cells[metric] for metric in COLUMNS)] for key, cells in scores.items()]
+        lines += [[*key, *(cells[metric] for metric in shown)] for key, cells in scores.items()]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
