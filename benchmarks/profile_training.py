@@ -55,7 +55,7 @@ def main() -> None:
         name = event.key
         if name in PRODUCTS:
             name = "matrix products"
-        elif "Backward" in name or name.startswith(("autograd::", "_OneDNN")):
+        elif "Backward" in name or name.startswith(("autograd::", "_Stack")):
             name = "autograd"
         elif name.startswith("Optimizer"):
             name = "Adam"

@@ -99,7 +99,7 @@ def test_an_unknown_id_is_gymnasiums_business(tiny_pearl: MakePEARL) -> None:
         ({"explorer": "random"}, "explorer is 'random', expected one of"),
         ({"train_explorer": "random"}, "explorer is 'random'"),
         ({"matmul_precision": "bf16"}, r"matmul_precision is 'bf16', expected one of \['highest', 'high', 'medium'\]"),
-        ({"policy_kwargs": {"latent_dim": 0}}, "latent_dim is 0, expected at least 1"),
+        ({"policy_kwargs": {"latent_dim": 0}}, "latent_dim is 0, expected a whole number of at least 1"),
         ({"replay_buffer_kwargs": {"relabel_probability": -1}}, "relabel_probability is -1"),
         ({"buffer_size": 10}, "buffer_size is 10, too small"),
         ({"policy": "CnnPolicy"}, "CnnPolicy unknown"),
@@ -334,7 +334,7 @@ numbers = st.one_of(st.integers(-3, 300), st.floats(-2, 2), st.just(float("nan")
         st.sampled_from(["meta_batch_size", "batch_size", "context_size", "gamma", "tau", "kl_coef", "gradient_steps"]),
         numbers,
     ),
-    st.dictionaries(st.sampled_from(["relabel_probability", "context_episodes", "relabel", "rl_batch_source"]), numbers),
+    st.dictionaries(st.sampled_from(["relabel_probability", "context_episodes", "rl_reward_type"]), numbers),
 )
 def test_fuzzed_settings_are_taken_or_refused_in_one_sentence(kwargs: dict[str, Any], replay: dict[str, Any]) -> None:
     try:

@@ -4,10 +4,13 @@ import re
 import runpy
 import shlex
 from pathlib import Path
+from types import ModuleType
 
 import agents_table
+import benchmark_tables
 import env_pages
 import pytest
+import tables
 from tables import filled
 
 from helpers.runs import SMALL
@@ -60,6 +63,14 @@ def test_the_table_of_agents_is_that_of_the_files() -> None:
     text = (agents_table.AGENTS / "README.md").read_text()
     scores = agents_table.read_scores()
     assert text == filled(text, {"agents": agents_table.table(scores)}), "run python tools/agents_table.py"
+
+
+@pytest.mark.parametrize("tool", [tables, benchmark_tables], ids=lambda tool: tool.__name__)
+def test_tables_are_those_of_the_results(tool: ModuleType) -> None:
+    texts, contents = [document.read_text() for document in tool.DOCUMENTS], tool.tables()
+    assert texts == [filled(text, contents) for text in texts], f"run python tools/{tool.__name__}.py"
+    shown = {mark for text in texts for mark in re.findall(r"<!-- (\S+) -->\n", text)} - {"end"}
+    assert contents.keys() <= shown, "a table that no page shows"
 
 
 def test_the_tests_that_repeat_a_figure_are_there() -> None:

@@ -13,6 +13,7 @@ from helpers import ENV_ID, many
 from helpers.experience import make_buffer
 from htr_envs import PointRobotFamily, TargetSpeedFamily
 from sb3_htr.adaptation.explorers import EXPLORERS, to_explorer
+from sb3_htr.common.checks import keywords_of
 from sb3_htr.htr.relabel import RELABELLERS
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run.method import merged
@@ -29,8 +30,8 @@ anything = st.one_of(
     st.sampled_from(["random", "final", "even", "episode", "task", "sparse", "dense"]),
 )
 BUFFER_SETTINGS = ["relabel_probability", "rl_reward_type", "context_episodes", "buffer_size"]
-RELABELLER_SETTINGS = ["hindsight_task_strategy", "rl_batch_source", "cell_size", "exploratory_fraction"]
-EXPLORER_SETTINGS = ["n_exploration_episodes", "scale", "max_setbacks", "clearly_better"]
+RELABELLER_SETTINGS = sorted(set().union(*map(keywords_of, RELABELLERS.values())))
+EXPLORER_SETTINGS = sorted(set().union(*map(keywords_of, EXPLORERS.values())))
 
 
 def settings_of(names: list[str]) -> st.SearchStrategy[dict[str, Any]]:

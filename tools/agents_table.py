@@ -55,9 +55,7 @@ def measure(path: Path, known: dict[str, list[float]]) -> dict[str, list[float]]
             scores[explorer] = known[explorer]
             continue
         print(f"Adapting {path.name} of {path.parent.name} by {explorer}")
-        # An agent's own one has the settings that were saved with it
-        by = None if explorer == model.explorer.name else explorer
-        returns, successes, _ = record_adaptation(model, agent.make_vec_env(100), None, N_EPISODES, by)
+        returns, successes, _ = record_adaptation(model, agent.make_vec_env(100), None, N_EPISODES, explorer)
         first = np.where(successes.any(axis=1), successes.argmax(axis=1) + 1, N_EPISODES + 1)
         scores[explorer] = [float(returns[:, -1].mean()), float(successes[:, -1].mean()), float(first.mean())]
     return scores

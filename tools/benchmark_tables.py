@@ -1,4 +1,4 @@
-"""Writes the tables of docs/performance.md and docs/scaling.md from ``benchmarks/results/*.json``."""
+"""Writes the tables of benchmarks from ``benchmarks/results/*.json``."""
 
 import json
 from pathlib import Path
@@ -8,6 +8,7 @@ from tables import fill
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
+DOCUMENTS = [ROOT / "docs" / name for name in ("performance.md", "scaling.md", "rivals.md")]
 
 
 def table(content: dict[str, Any]) -> str:
@@ -59,12 +60,18 @@ def _decimals(value: float) -> int:
     return 0 if value >= 100 else 2 if value >= 1 else 3
 
 
-def main() -> None:
-    """All benchmarks that were run."""
+def tables() -> dict[str, str]:
+    """
+    :return: of all benchmarks that were run, by the names of their marks
+    """
     contents = [json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))]
-    tables = {f"benchmark:{c['name']}": shares(c) if "shares" in c else table(c) for c in contents}
-    tables["benchmarks"] = summary(contents)
-    fill([ROOT / "docs" / name for name in ("performance.md", "scaling.md")], tables)
+    own = {f"benchmark:{c['name']}": shares(c) if "shares" in c else table(c) for c in contents}
+    return {**own, "benchmarks": summary(contents)}
+
+
+def main() -> None:
+    """Into all documents."""
+    fill(DOCUMENTS, tables())
 
 
 if __name__ == "__main__":

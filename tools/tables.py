@@ -127,11 +127,18 @@ def fill(documents: Iterable[Path], tables: dict[str, str]) -> None:
             temporary.write_text(text)
 
 
-def main() -> None:
-    """All results that are there."""
+def tables() -> dict[str, str]:
+    """
+    :return: of all results that are there, by the names of their marks
+    """
     summaries = [json.loads(path.read_text()) for path in sorted(Path(RESULTS).glob("*/summary.json"))]
-    tables = {f"results:{summary['name']}": table(summary) for summary in summaries}
-    fill(DOCUMENTS, {**tables, "headline": headline({summary["name"]: summary for summary in summaries})})
+    own = {f"results:{summary['name']}": table(summary) for summary in summaries}
+    return {**own, "headline": headline({summary["name"]: summary for summary in summaries})}
+
+
+def main() -> None:
+    """Into all documents."""
+    fill(DOCUMENTS, tables())
 
 
 if __name__ == "__main__":

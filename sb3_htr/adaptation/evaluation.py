@@ -42,15 +42,6 @@ class MetaLearner(Protocol):
         ...
 
 
-def own_or_named(model: MetaLearner, name: str) -> str | None:
-    """
-    :param model: may have an explorer of this name, with settings of its own
-    :param name: of an explorer
-    :return: None, which is the model's own, if it is that; else the name
-    """
-    return None if name == model.explorer.name else name
-
-
 class AdaptationRecord(NamedTuple):
     """
     What happened in the adaptation episodes of some tasks.
@@ -68,7 +59,7 @@ class AdaptationRecord(NamedTuple):
 
 
 def run_adaptation(
-    policy: BasePolicy, env: VecEnv, adaptation: Adapts, n_episodes: int, deterministic: bool = True
+    policy: BasePolicy, env: VecEnv, adaptation: Adapts, n_episodes: int, deterministic: bool = True, seed: int = 0
 ) -> AdaptationRecord:
     """
     Run ``n_episodes`` episodes of each env, from a reset on.
@@ -78,6 +69,7 @@ def run_adaptation(
     :param adaptation: acts, and learns from the episodes
     :param n_episodes: episodes per env
     :param deterministic: mean actions instead of samples
+    :param seed: seed of sampled actions; the random state of training is left alone
     :return: one row per env
     :raises ValueError: if there are no episodes
     """
@@ -89,14 +81,18 @@ def run_adaptation(
     steps: list[np.ndarray] = []
     episode_of_step: list[np.ndarray] = []
     act = partial(adaptation.act, deterministic=deterministic)
-    for step in adaptation_steps(env, adaptation, n_episodes, policy.unscale_action, act):
-        # Envs that are ahead of the others write to a column that is cut off
-        column = np.minimum(episode, n_episodes)
-        returns[envs, column] += step.rewards
-        successes[envs, column] |= [info.get("is_success", False) for info in step.infos]
-        steps.append(np.array([info.get("achieved_task", ()) for info in step.infos], dtype=np.float32))
-        episode_of_step.append(column)
-        episode += step.dones
+    # Actions are drawn by torch's global generator
+    with th.random.fork_rng(enabled=not deterministic):
+        if not deterministic:
+            th.manual_seed(seed)
+        for step in adaptation_steps(env, adaptation, n_episodes, policy.unscale_action, act):
+            # Envs that are ahead of the others write to a column that is cut off
+            column = np.minimum(episode, n_episodes)
+            returns[envs, column] += step.rewards
+            successes[envs, column] |= [info.get("is_success", False) for info in step.infos]
+            steps.append(np.array([info.get("achieved_task", ()) for info in step.infos], dtype=np.float32))
+            episode_of_step.append(column)
+            episode += step.dones
     achieved = _by_episode(np.stack(steps, axis=1), np.stack(episode_of_step, axis=1), n_episodes)
     return AdaptationRecord(returns[:, :n_episodes], successes[:, :n_episodes], achieved)
 
@@ -123,6 +119,15 @@ def record_adaptation(
 ) -> AdaptationRecord:
     """
     As :func:`evaluate_adaptation`, with what each step achieved.
+
+    :param model: as for :func:`evaluate_adaptation`, and so are all arguments and what is raised
+    :param env: env, VecEnv or registered id
+    :param tasks: (n_tasks, task_dim)
+    :param n_episodes: adaptation episodes per task
+    :param explorer: an explorer, its name, or its name and settings
+    :param deterministic: mean actions instead of samples
+    :param seed: seed of env, z and sampled actions
+    :return: returns, successes and achieved tasks
     """
     check_is_no_gymnasium_vector_env(env)
     n_tasks = 20 if tasks is None else len(tasks)
@@ -137,17 +142,13 @@ def record_adaptation(
     generator = th.Generator().manual_seed(seed)
     env.seed(seed)
     records = []
-    # Actions are drawn by torch's global generator
-    with th.random.fork_rng(enabled=not deterministic):
-        if not deterministic:
-            th.manual_seed(seed)
-        for first in range(0, len(tasks), env.num_envs):
-            # Envs without a task of their own repeat the last one
-            index = np.minimum(np.arange(first, first + env.num_envs), len(tasks) - 1)
-            env.set_options([{"task": task} for task in tasks[index]])
-            adaptation = model.start_adaptation(env.num_envs, explorer, generator)
-            record = run_adaptation(model.policy, env, adaptation, n_episodes, deterministic)
-            records.append([values[: len(tasks) - first] for values in record])
+    for first in range(0, len(tasks), env.num_envs):
+        # Envs without a task of their own repeat the last one
+        index = np.minimum(np.arange(first, first + env.num_envs), len(tasks) - 1)
+        env.set_options([{"task": task} for task in tasks[index]])
+        adaptation = model.start_adaptation(env.num_envs, explorer, generator)
+        record = run_adaptation(model.policy, env, adaptation, n_episodes, deterministic, seed + first)
+        records.append([values[: len(tasks) - first] for values in record])
     length = max(achieved.shape[2] for _, _, achieved in records)
     for record_ in records:
         padding = ((0, 0), (0, 0), (0, length - record_[2].shape[2]), (0, 0))

@@ -59,7 +59,3 @@ class ContextualPolicy(Protocol):
     def act(self, obs: np.ndarray, z: np.ndarray, deterministic: bool = False) -> np.ndarray:
         """Actions (n, action_dim), scaled to [-1, 1], for observations (n, obs_dim) and task variables (n, latent_dim)."""
         ...
-
-    def unscale_action(self, scaled_action: np.ndarray) -> np.ndarray:
-        """Actions in the bounds of the action space."""
-        ...

@@ -67,10 +67,20 @@ def check_numbers(**numbers: tuple[Any, float, float]) -> None:
         whole = isinstance(low, int)
         kind = int | np.integer if whole else int | float | np.number
         # written so that nan, which compares with nothing, is refused too
-        if not (isinstance(value, kind) and low <= value <= high):
+        if isinstance(value, bool) or not (isinstance(value, kind) and low <= value <= high):
             article = "a whole number" if whole else "a number"
             limits = f"of at least {low:g}" if high == float("inf") else f"from {low:g} to {high:g}"
             raise ValueError(f"{name} is {value!r}, expected {article} {limits}.")
+
+
+def check_flags(**flags: Any) -> None:
+    """
+    :param flags: name of a setting and its value
+    :raises ValueError: for the first one that is neither True nor False, as a word in a YAML file is
+    """
+    for name, value in flags.items():
+        if not isinstance(value, bool):
+            raise ValueError(f"{name} is {value!r}, expected True or False.")
 
 
 def keywords_of(function: Callable[..., Any]) -> set[str]:

@@ -49,7 +49,7 @@ class TaskFamily(Protocol):
 
 class Context(NamedTuple):
     """
-    Transitions of M tasks, those of the first task first: what a posterior is inferred from. All float32.
+    Transitions of M tasks, those of the first task first: what a posterior is inferred from. All float32 but the lengths.
 
     :param observations: (n, obs_dim)
     :param actions: (n, action_dim), scaled to [-1, 1]

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_htr.adaptation.evaluation import evaluate_adaptation, own_or_named
+from sb3_htr.adaptation.evaluation import evaluate_adaptation
 from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.experiments.ablations import ABLATIONS
@@ -35,7 +35,7 @@ def evaluate(cell: Cell, model: Model) -> KwArgs:
         env_kwargs = {**cell.env_kwargs, **evaluation.tested_on}
         family = get_task_family(make_task_vec_env(cell.env_id, env_kwargs=env_kwargs))
         env = make_task_vec_env(cell.env_id, len(family.test_tasks), env_kwargs=env_kwargs)
-        explorer = ABLATIONS.get(evaluation.explorer, own_or_named(model, evaluation.explorer))
+        explorer = ABLATIONS.get(evaluation.explorer, evaluation.explorer)
         records = [
             evaluate_adaptation(model, env, n_episodes=cell.n_episodes, explorer=explorer, seed=seed) for seed in EVAL_SEEDS
         ]

@@ -141,6 +141,7 @@ class EpisodeStore:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """
         :param state: of :meth:`state_dict` of a store of the same shape
+        :raises ValueError: if it is of a store of another shape
         """
         arrays = {name: tensor.cpu().numpy().copy() for name, tensor in state.items()}
         if arrays["data"].shape[1:] != self._data.shape[1:] or arrays["slots"].shape[1] != self.episodes_per_task:

@@ -403,13 +403,14 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
     ) -> Adaptation:
         """
         :param n_envs: number of tasks to adapt to side by side
-        :param explorer: an explorer, its name, or its name and settings; the model's own by default
+        :param explorer: an explorer, its name, or its name and settings; by default, and where the name alone is that of the
+            model's own, the model's own
         :param generator: source of randomness; torch's global one by default
         :param is_training: whether infos tell which part of a reward depends on no task
         :return: chooses z and takes in what happens
         :raises ValueError: if the explorer goes by successes, and the model was trained on a family without
         """
-        chosen = self.explorer if explorer is None else to_explorer(explorer)
+        chosen = self.explorer if explorer in (None, self.explorer.name) else to_explorer(explorer)
         self._check_explorer(chosen)
         return Adaptation(self.policy, self.knowledge, chosen, n_envs, self.context_size, generator, is_training)
 
@@ -438,8 +439,7 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
             env does not say so (``info["is_success"]``), whether a reward was told from what is task-free
         :raises ValueError: for several envs, an env with other spaces, a task that the env does not have
         """
-        if n_episodes < 1:
-            raise ValueError(f"n_episodes is {n_episodes}, expected at least 1.")
+        checks.check_numbers(n_episodes=(n_episodes, 1, float("inf")))
         vec_env = self._wrap_env(make_task_vec_env(env) if isinstance(env, str) else env, monitor_wrapper=False)
         if vec_env.num_envs != 1:
             raise ValueError(f"adapt() adapts to one task, but the VecEnv has {vec_env.num_envs} envs: pass a single env.")

@@ -63,7 +63,7 @@ class PEARL(OffPolicyMetaAlgorithm):
         at .5 and 2. It learns in each update: in one of four, at four times the weight, the Wheeled robot solves .90 of the
         validation tasks in place of all (one seed)
     :param n_tasks_per_rollout: training tasks per rollout (PEARL's reference: 10)
-    :param n_episodes_per_task: episodes on each of them, from 2 to 10 by default, of 400 steps in all
+    :param n_episodes_per_task: episodes on each of them; by default as many as make up 400 steps, from 2 to 10
     :param explorer: chooses z at meta-test: an :class:`sb3_htr.adaptation.Explorer`, its name, or its name and settings,
         ``{"name": "prior", "n_exploration_episodes": 9}``
     :param train_explorer: the same for rollouts

@@ -14,6 +14,7 @@ from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, SACP
 from torch import nn
 
 from sb3_htr.adaptation.context import context_dim, context_rows
+from sb3_htr.common.checks import check_numbers
 from sb3_htr.common.latent_policy import LatentPolicy
 from sb3_htr.common.linear import Linear, Stack, with_fast_layers
 from sb3_htr.common.normalizer import ObservationNormalizer
@@ -98,8 +99,7 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
-        if latent_dim < 1:
-            raise ValueError(f"latent_dim is {latent_dim}, expected at least 1.")
+        check_numbers(latent_dim=(latent_dim, 1, float("inf")))
         if optimizer_class is th.optim.Adam:
             optimizer_kwargs = {"fused": True, **(optimizer_kwargs or {})}
         self.latent_dim = latent_dim

@@ -1,8 +1,7 @@
 """A learned model of rewards, by which tasks that nobody listed can be told apart."""
 
-from itertools import pairwise
-
 import torch as th
+from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 from torch.nn import functional as F
 
@@ -15,9 +14,8 @@ MIN_LOG_STD = -3.5
 SCALE_RATE = 0.01
 
 
-def _mlp(units: list[int]) -> nn.Module:
-    layers = [module for i, o in pairwise(units) for module in (nn.Linear(i, o), nn.ReLU())]
-    return with_fast_layers(nn.Sequential(*layers[:-1]))
+def _mlp(inputs: int, hidden: list[int], outputs: int) -> nn.Module:
+    return with_fast_layers(nn.Sequential(*create_mlp(inputs, outputs, hidden)))
 
 
 class RewardModel(nn.Module):
@@ -42,9 +40,9 @@ class RewardModel(nn.Module):
     def __init__(self, obs_dim: int, action_dim: int, latent_dim: int, width: int = 32, hidden: int = 128) -> None:
         super().__init__()
         self.width = width
-        self.state_tower = _mlp([obs_dim, hidden, hidden, 2 * width])
-        self.task_tower = _mlp([latent_dim, hidden, hidden, 2 * width + 1])
-        self.task_free_net = _mlp([2 * obs_dim + action_dim, hidden // 2, hidden // 2, 1])
+        self.state_tower = _mlp(obs_dim, [hidden] * 2, 2 * width)
+        self.task_tower = _mlp(latent_dim, [hidden] * 2, 2 * width + 1)
+        self.task_free_net = _mlp(2 * obs_dim + action_dim, [hidden // 2] * 2, 1)
         self.raw_sharpness = nn.Parameter(th.tensor(3.0))
         self.log_std = nn.Parameter(th.tensor(-1.0))
         # Mean reward of a success, 0 before the first

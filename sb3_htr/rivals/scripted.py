@@ -53,7 +53,7 @@ class ScriptedAgent:
     def start_adaptation(self, n_envs: int, explorer: Any = None, generator: th.Generator | None = None) -> ToldAdaptation:
         """
         :param n_envs: number of tasks
-        :param explorer: not used
+        :param explorer: None or ``"own"``: a script explores in no other way
         :param generator: not used
         :return: acts by the script
         """

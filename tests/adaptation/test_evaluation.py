@@ -167,7 +167,7 @@ def test_adapt_keeps_one_task_when_the_env_has_none(tiny_pearl: MakePEARL) -> No
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda m: m.adapt(ENV_ID, n_episodes=0), "n_episodes is 0, expected at least 1"),
+        (lambda m: m.adapt(ENV_ID, n_episodes=0), "n_episodes is 0, expected a whole number of at least 1"),
         (lambda m: m.adapt(make_task_vec_env(ENV_ID, 2)), "the VecEnv has 2 envs"),
         (lambda m: m.adapt(ENV_ID, task=80), "80"),
         (lambda m: m.adapt(ENV_ID, explorer="x"), "explorer is 'x', expected one of"),

@@ -112,7 +112,7 @@ def test_a_hindsight_buffer_holds_each_episode_once(tiny_pearl: MakePEARL) -> No
 def test_memory_grows_with_the_number_of_hindsight_buffers() -> None:
     coarse, fine = (filled(cell_size=size, exploratory_fraction=0.0)[1] for size in (0.5, 0.05))
     assert fine.n_hindsight_buffers > coarse.n_hindsight_buffers
-    assert fine.nbytes == 60 * 20 * 9 * 4 > coarse.nbytes, "a buffer has the capacity of a real one"
+    assert fine.nbytes > coarse.nbytes and fine.stats()["replay/hindsight_megabytes"] == fine.episodes.nbytes / 1e6
 
 
 def test_a_task_space_can_bring_its_own_discretiser() -> None:

@@ -38,8 +38,8 @@ def play(env: gym.Env[Any, Any], seed: int, **reset_kwargs: Any) -> list[tuple[A
 # ---------------------------------------------------------------- every registered env
 
 
-def test_the_point_robot_is_registered() -> None:
-    assert POINT_ROBOT in ENV_IDS
+def test_all_families_are_registered_with_a_batched_env() -> None:
+    assert set(ENV_IDS) == {POINT_ROBOT, "SparseTargetSpeed-v0", "SparseWheeled-v0", "SparseAnt-v0"}
 
 
 @all_envs

@@ -7,6 +7,7 @@ import shutil
 import sys
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -139,6 +140,18 @@ def test_an_exported_agent_is_exported_again_in_place(
     assert f"{returns[:, -1].mean():.2f}" in (folder / "README.md").read_text()
     assert main(["evaluate", str(folder), "--n-episodes", "3", "-o", str(tmp_path)]) == 0
     np.testing.assert_allclose(np.load(tmp_path / "adaptation.npz")["returns"], returns, atol=1e-5)
+
+
+@pytest.mark.parametrize("explorer", ["belief", {"name": "belief", "margin": 2.0}])
+def test_an_explorer_named_by_its_record_is_the_agents_own(explorer: Any, tmp_path: Path, tiny_pearl: MakePEARL) -> None:
+    """As a word or with settings; and `--explorer` with its name alone is the same in every command."""
+    run = make_run(tmp_path / "logs", tiny_pearl(explorer=explorer).learn(480), hyperparams={"explorer": explorer})
+    agent = agent_at(run)
+    assert agent.explorer == "belief"
+    model = agent.load()
+    assert isinstance(model, PEARL)
+    assert model.start_adaptation(1, "belief").explorer.margin == model.explorer.margin  # type: ignore[attr-defined]
+    assert main(["plot", str(run), str(run), "-l", "A", "B", "-o", str(tmp_path / "x.png")]) == 0
 
 
 def test_normalized_agents_are_exported_with_their_statistics(tmp_path: Path, tiny_pearl: MakePEARL) -> None:

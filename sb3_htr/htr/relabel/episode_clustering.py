@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import torch as th
 
+from sb3_htr.common.checks import check_flags
 from sb3_htr.common.type_aliases import Trajectory
 from sb3_htr.htr.episode_store import EpisodeStore
 from sb3_htr.htr.relabel.base import HindsightDraw, Relabeller
@@ -81,6 +82,9 @@ class EpisodeClustering(Relabeller):
     ) -> None:
         if not (isinstance(exploratory_fraction, int | float) and 0 <= exploratory_fraction < 1):
             raise ValueError(f"exploratory_fraction is {exploratory_fraction!r}, expected a number from 0 to below 1.")
+        check_flags(prefer_unsolved=prefer_unsolved)
+        if not (discretiser is None or callable(discretiser)):
+            raise ValueError(f"discretiser is {discretiser!r}, expected a function of tasks, or None for a grid.")
         self.discretiser = GridDiscretiser(cell_size) if discretiser is None else discretiser
         self.exploratory_fraction = exploratory_fraction
         self.hindsight_task_strategy = HindsightTaskStrategy.of(hindsight_task_strategy)
@@ -104,7 +108,7 @@ class EpisodeClustering(Relabeller):
     @property
     def nbytes(self) -> int:
         """Bytes of memory that the episodes of all hindsight buffers take."""
-        return int(self.episodes.rows[:1].nbytes * self.episodes.index().task_row[-1])
+        return self.episodes.nbytes
 
     def rewarded_fraction(self) -> tuple[float, float]:
         """

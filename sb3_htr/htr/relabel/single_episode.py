@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sb3_htr.common.checks import check_numbers
+from sb3_htr.common.checks import check_flags, check_numbers
 from sb3_htr.common.type_aliases import Trajectory
 from sb3_htr.htr.relabel.base import HindsightDraw, Relabeller
 from sb3_htr.htr.relabel.hindsight_task import HindsightTaskStrategy, solved_at_start
@@ -39,6 +39,7 @@ class SingleEpisodeRelabelling(Relabeller):
         prefer_unsolved: bool = True,
     ) -> None:
         check_numbers(elsewhere=(elsewhere, 0.0, 1.0))
+        check_flags(prefer_unsolved=prefer_unsolved)
         self.elsewhere = elsewhere
         self.hindsight_task_strategy = HindsightTaskStrategy.of(hindsight_task_strategy)
         if rl_batch_source not in ("episode", "task"):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sb3_htr.adaptation.evaluation import AdaptationRecord, own_or_named, record_adaptation
+from sb3_htr.adaptation.evaluation import AdaptationRecord, record_adaptation
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checks import get_task_family
 from sb3_htr.zoo.commands.arguments import add_adaptation_arguments, add_agent_arguments, make_parser, parse
@@ -44,9 +44,8 @@ def main(argv: Sequence[str]) -> None:
     family = get_task_family(env)
     tasks = getattr(family, f"{args.tasks}_tasks")
     explorer = args.explorer or model.explorer.name
-    by = own_or_named(model, explorer)
     record = record_adaptation(
-        model, env, tasks, args.n_episodes, explorer=by, deterministic=not args.stochastic, seed=args.seed
+        model, env, tasks, args.n_episodes, explorer=explorer, deterministic=not args.stochastic, seed=args.seed
     )
     print(f"{agent.path}: adapting to {len(tasks)} {args.tasks} tasks of {agent.env_id}, explorer {explorer!r}")
     print(table(record))

@@ -9,7 +9,7 @@ from typing import Any
 
 from stable_baselines3 import SAC
 
-from sb3_htr.adaptation.evaluation import own_or_named, record_adaptation
+from sb3_htr.adaptation.evaluation import record_adaptation
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checks import get_task_family, keywords_of
 from sb3_htr.zoo.commands.arguments import add_agent_arguments, make_parser, parse
@@ -108,9 +108,7 @@ def main(argv: Sequence[str]) -> None:
     model, env = exported.load(trust=args.trust), exported.make_vec_env(20)
     tasks = get_task_family(env).test_tasks
     explorers = dict.fromkeys([model.explorer.name, *exported.algorithm.also_explores_by])
-    scores = {
-        name: record_adaptation(model, env, tasks, args.n_episodes, explorer=own_or_named(model, name)) for name in explorers
-    }
+    scores = {explorer: record_adaptation(model, env, tasks, args.n_episodes, explorer=explorer) for explorer in explorers}
     repo_id = args.push_to_hub
     if repo_id is not None and "/" not in repo_id:
         repo_id += f"/{name}"

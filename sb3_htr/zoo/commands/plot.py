@@ -76,7 +76,7 @@ def adapt(agent: TrainedAgent, args: argparse.Namespace) -> Adapted:
     env.seed(args.seed)
     env.set_options([{"task": task} for task in tasks])
     adaptation = model.start_adaptation(len(tasks), args.explorer, th.Generator().manual_seed(args.seed))
-    record = run_adaptation(model.policy, env, adaptation, args.n_episodes, deterministic=not args.stochastic)
+    record = run_adaptation(model.policy, env, adaptation, args.n_episodes, not args.stochastic, args.seed)
     latent = None
     if isinstance(adaptation, Adaptation):
         particles, found = adaptation.knowledge.particles(), ~adaptation.exploring()

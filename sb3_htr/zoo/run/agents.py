@@ -22,10 +22,10 @@ from sb3_htr.zoo.run.shipped import shipped
 
 # Record of a run: in its folder, and in an exported model file
 RECORD = "run.json"
+# Its bytes, at most
+MAX_RECORD = 2**20
 # What it must say, and what it may say for training on and for model cards
 REQUIRED = {"env_id": str, "env_kwargs": dict, "gym_packages": list}
-# Bytes of a record
-MAX_RECORD = 2**20
 OF_TRAINING = {"arguments": list, "n_timesteps": int, "seed": int, "method": str, "hyperparams": dict}
 
 
@@ -57,11 +57,6 @@ class TrainedAgent:
         return str(self.record.get("method", "unknown"))
 
     @property
-    def name(self) -> str:
-        """How a picture calls it: the run folder or the file."""
-        return self.folder.name if self.folder is not None else f"{self.path.parent.name}/{self.path.stem}"
-
-    @property
     def algorithm(self) -> Algorithm:
         """What trained it; PEARL if that is not said."""
         return methods().get(self.method, get_method(DEFAULT)).algorithm
@@ -69,8 +64,8 @@ class TrainedAgent:
     @property
     def explorer(self) -> str:
         """Name of the explorer that it was evaluated with in its training."""
-        explorer = self.record.get("hyperparams", {}).get("explorer", {"name": OWN})
-        return str(explorer["name"])
+        explorer = self.record.get("hyperparams", {}).get("explorer", OWN)
+        return str(explorer["name"] if isinstance(explorer, dict) else explorer)
 
     def load(self, device: str = "cpu", trust: bool = False) -> Model:
         """

@@ -113,6 +113,8 @@ class Player:
         self.vec_env = DummyVecEnv([lambda: self.camera])
         self.vec_env.seed(seed)
         self.generator = th.Generator().manual_seed(seed)
+        # Of sampled actions
+        th.manual_seed(seed)
 
     def play(self, tasks: np.ndarray, number: int, n_episodes: int) -> Iterator[Moment]:
         """
