@@ -15,7 +15,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL, many
 from htr_envs import PointRobotEnv, PointRobotVectorEnv
-from sb3_htr import PEARL
+from sb3_htr import PEARL, evaluate_adaptation, load_untrusted
+from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
 from sb3_htr.zoo.cli import main
 
@@ -342,3 +343,79 @@ def test_fuzzed_settings_are_taken_or_refused_in_one_sentence(kwargs: dict[str, 
     except ValueError as error:
         assert str(error).count("\n") == 0
         assert any(name in str(error) for name in (*kwargs, *replay))
+
+
+class DropsOptions(gym.Wrapper[Any, Any, Any, Any]):
+    """A wrapper as people write them."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        return self.env.reset(seed=seed)
+
+
+def test_an_env_that_is_on_other_tasks_than_asked_for_is_refused(tiny_pearl: MakePEARL) -> None:
+    """Else its experience would be that of other tasks, and its scores those of training tasks."""
+    env = DropsOptions(gym.make(ENV_ID))
+    model = tiny_pearl().learn(ROLLOUT)
+    test = get_task_family(make_task_vec_env(ENV_ID)).test_tasks
+    for act in (
+        lambda: tiny_pearl(env).learn(ROLLOUT),
+        lambda: evaluate_adaptation(model, env, n_episodes=1),
+        lambda: model.adapt(env, n_episodes=1, task=test[0]),
+    ):
+        with pytest.raises(ValueError, match=r"The env was asked for the task.* must hand on options"):
+            act()
+
+
+@pytest.mark.parametrize("explorer", ["belief", "prior", "aggregate", "learned-prior"])
+def test_nan_at_meta_test_is_refused(explorer: str, tiny_pearl: MakePEARL) -> None:
+    """It would become NaN actions, or evidence."""
+    model = tiny_pearl().learn(ROLLOUT)
+
+    class Fails(gym.Wrapper[Any, Any, Any, Any]):
+        what = ""
+
+        def step(self, action: Any) -> Any:
+            obs, reward, *rest = self.env.step(action)
+            return (obs, np.nan, *rest) if self.what == "rewards" else (obs * np.nan, reward, *rest)
+
+    for what in ("rewards", "observations"):
+        env = Fails(gym.make(ENV_ID))
+        env.what = what
+        with pytest.raises(ValueError, match=rf"The (next_)?{what} of env 0 are .*nan.* expected finite numbers"):
+            model.adapt(env, n_episodes=2, explorer=explorer)
+    adaptation = model.start_adaptation(2)
+    with pytest.raises(ValueError, match=r"observations have shape \(2,\), expected \(2, obs_dim\), a row for each env"):
+        adaptation.act(np.zeros(2, dtype=np.float32))
+
+
+def test_a_state_that_is_no_z_is_refused(tiny_pearl: MakePEARL) -> None:
+    model, obs, z = tiny_pearl(), np.zeros((4, 2), dtype=np.float32), np.zeros((4, 3), dtype=np.float32)
+    states: list[Any] = [z, (z[:2],), (z, z), (np.zeros((4, 2)),)]
+    for state in states:
+        with pytest.raises(ValueError, match=r"expected a tuple of one array, z, of shape \(4, 3\)"):
+            model.predict(obs, state=state)
+    assert model.predict(obs, state=(z[:1],))[0].shape == (4, 2)
+
+
+@pytest.mark.parametrize("trial", [["--trial-id", "0"], ["--storage", "x.log", "--study-name", "x"]])
+def test_half_a_trial_is_refused(trial: list[str], tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="A trial is named by --storage, --study-name, --trial-id, from 0 on: add --"):
+        main(["train", "--env", ENV_ID, "-f", str(tmp_path), *trial])
+
+
+def test_a_model_file_that_is_not_there_is_not_damaged(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    tiny_pearl().save(tmp_path / "model")
+    assert load_untrusted(tmp_path / "model", ENV_ID).policy.latent_dim == 3
+    with pytest.raises(FileNotFoundError):
+        load_untrusted(tmp_path / "nothing", ENV_ID)
+
+
+def test_a_hindsight_task_that_its_step_does_not_solve_is_named(
+    tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = make_task_vec_env(ENV_ID, 4)
+    family = get_task_family(env)
+    right = family.hindsight_task
+    monkeypatch.setattr(type(family), "hindsight_task", lambda self, traj, step: right(traj, step) + 3)
+    with pytest.raises(ValueError, match="hindsight_task names a task that its own step does not solve"):
+        tiny_pearl(env).learn(ROLLOUT)

@@ -89,7 +89,10 @@ class Adaptation:
         :param obs: (n_envs, obs_dim)
         :param deterministic: mean actions instead of samples
         :return: (n_envs, action_dim), scaled to [-1, 1]
+        :raises ValueError: for an array of another shape, NaN and infinity
         """
+        if not self.is_training:
+            self._check("observations", obs, 2)
         self.explorer.look(obs)
         return self.policy.act(obs, self.z, deterministic)
 
@@ -108,7 +111,12 @@ class Adaptation:
     def observe(self, step: Step) -> None:
         """
         :param step: what each env did
+        :raises ValueError: for arrays of other shapes, NaN and infinity
         """
+        if not self.is_training:  # what is collected is checked where it is stored
+            self._check("observations", step.observations, 2)
+            self._check("rewards", step.rewards, 1)
+            self._check("next_observations", step.next_observations, 2)
         self._remember(step.observations, step.actions, step.rewards)
         self.task_reward = self._told(step) if self.is_training else self._learned(step)
         self.episode_return += self.task_reward
@@ -118,6 +126,18 @@ class Adaptation:
         self.explorer.observe(step)
         self.episode_return[ended] = 0
         self._n_steps[ended] = 0
+
+    def _check(self, name: str, values: np.ndarray, n_axes: int) -> None:
+        shape = np.shape(values)
+        if len(shape) != n_axes or shape[0] != self.n_envs:
+            expected = f"({self.n_envs},)" if n_axes == 1 else f"({self.n_envs}, obs_dim)"
+            raise ValueError(f"The {name} have shape {shape}, expected {expected}, a row for each env.")
+        if not np.isfinite(values).all():
+            env = int((~np.isfinite(values)).reshape(self.n_envs, -1).any(axis=1).argmax())
+            raise ValueError(
+                f"The {name} of env {env} are {values[env]}, expected finite numbers: they would be taken for "
+                "evidence. Begin a new Adaptation once the env is mended."
+            )
 
     @staticmethod
     def _told(step: Step) -> np.ndarray:

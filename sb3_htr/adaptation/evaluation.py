@@ -11,7 +11,14 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.loop import Adapts, Watched, adaptation_steps
-from sb3_htr.common.checks import check_is_no_gymnasium_vector_env, check_is_not_normalized, check_numbers, get_task_family
+from sb3_htr.common.checks import (
+    check_is_no_gymnasium_vector_env,
+    check_is_not_normalized,
+    check_numbers,
+    check_tasks,
+    get_max_episode_steps,
+    get_task_family,
+)
 from sb3_htr.common.vec_env import make_task_vec_env
 
 
@@ -139,6 +146,7 @@ def record_adaptation(
     tasks = get_task_family(env).test_tasks if tasks is None else np.asarray(tasks, dtype=np.float32)
     if tasks.ndim != 2 or len(tasks) == 0:
         raise ValueError(f"tasks have shape {tasks.shape}, expected (n_tasks, task_dim) with at least one task.")
+    get_max_episode_steps(env)
     generator = th.Generator().manual_seed(seed)
     env.seed(seed)
     records = []
@@ -148,6 +156,7 @@ def record_adaptation(
         env.set_options([{"task": task} for task in tasks[index]])
         adaptation = model.start_adaptation(env.num_envs, explorer, generator)
         record = run_adaptation(model.policy, env, adaptation, n_episodes, deterministic, seed + first)
+        check_tasks(env, tasks[index])
         records.append([values[: len(tasks) - first] for values in record])
     length = max(achieved.shape[2] for _, _, achieved in records)
     for record_ in records:

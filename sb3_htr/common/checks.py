@@ -242,13 +242,32 @@ def check_is_not_normalized(env: VecEnv) -> None:
         )
 
 
-def check_task_ids(env: VecEnv) -> None:
+OPTIONS = "its reset, or that of a wrapper around it, must hand on options."
+
+
+def check_task_ids(env: VecEnv, asked: np.ndarray) -> None:
     """
     :param env: env to train on, after a reset
-    :raises ValueError: if it does not say which task it is on
+    :param asked: (n_envs,) int, indices of the training tasks that it was asked for
+    :raises ValueError: if it does not say which task it is on, or is on another one
     """
     if any("task_id" not in info for info in env.unwrapped.reset_infos):
         raise ValueError(
             "The env's reset returns no info['task_id'], so its experience cannot be kept apart by task: "
             "add the index of the training task to the infos of reset and step."
         )
+    given = [info["task_id"] for info in env.unwrapped.reset_infos]
+    if given != asked.tolist():
+        raise ValueError(f"The env was asked for the tasks {asked.tolist()}, and is on {given}: {OPTIONS}")
+
+
+def check_tasks(env: VecEnv, asked: np.ndarray) -> None:
+    """
+    :param env: after a reset
+    :param asked: (n_envs, task_dim), tasks that it was asked for
+    :raises ValueError: if it is on other ones
+    """
+    if env.has_attr("task"):
+        given = np.stack(env.get_attr("task"))
+        if given.shape != asked.shape or not np.allclose(given, asked, rtol=1e-5, atol=1e-6):
+            raise ValueError(f"The env was asked for the task {asked[0]}, and is on {given[0]}: {OPTIONS}")

@@ -27,11 +27,23 @@ class LatentPolicy(BasePolicy):
     ) -> tuple[np.ndarray, State]:
         """
         :param observation: (obs_dim,) or (n, obs_dim)
-        :param state: tuple of one array, z of each observation (n, latent_dim); None is the prior mean
+        :param state: tuple of one array, z of each observation (n, latent_dim), or of all (1, latent_dim); None is the prior
+            mean
         :param episode_start: ignored: z lives longer than an episode
         :param deterministic: mean action instead of a sample
         :return: actions, and the state for the next call
+        :raises ValueError: for a state that is none
         """
+        n = len(observation) if np.ndim(observation) > 1 else 1  # type: ignore[arg-type]
+        if state is not None and not (
+            isinstance(state, tuple) and len(state) == 1 and np.shape(state[0]) in ((1, self.latent_dim), (n, self.latent_dim))
+        ):
+            what = (
+                tuple(map(np.shape, state))
+                if isinstance(state, tuple)
+                else f"{type(state).__name__} of shape {np.shape(state)}"
+            )
+            raise ValueError(f"state is {what}, expected a tuple of one array, z, of shape ({n}, {self.latent_dim}).")
         z = np.zeros((1, self.latent_dim), dtype=np.float32) if state is None else state[0]
         self._z = th.as_tensor(z, dtype=th.float32, device=self.device)
         actions, _ = super().predict(observation, None, episode_start, deterministic)

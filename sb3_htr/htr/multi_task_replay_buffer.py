@@ -276,7 +276,13 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             )
         ends = np.cumsum([len(episode) for _, episode in episodes]) - 1
         last = self.transitions.trajectory(rows[ends, None])
-        reward = self.task_family.compute_reward(last, self.task_family.hindsight_task(last, 0))
+        achieved = self.task_family.hindsight_task(last, 0)
+        if not self.task_family.is_success(last, achieved).all():
+            raise ValueError(
+                "hindsight_task names a task that its own step does not solve, by is_success: hindsight would teach what did "
+                "not happen. Run htr_envs.check_task_env(env) to find out more."
+            )
+        reward = self.task_family.compute_reward(last, achieved)
         worthless = task_reward(reward, last.task_free_reward)[:, 0] <= 0
         if worthless.any():
             i = int(worthless.argmax())

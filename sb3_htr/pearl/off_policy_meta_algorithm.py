@@ -336,7 +336,7 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
         env.set_options([{"task_id": int(task)} for task in tasks])
         obs = env.reset()
         assert isinstance(obs, np.ndarray)
-        checks.check_task_ids(env)
+        checks.check_task_ids(env, tasks)
         replay_buffer.discard_open_episodes()
         adaptation = self.start_adaptation(env.num_envs, self.train_explorer, is_training=True)
         act = partial(self._explore, adaptation, learning_starts)
@@ -446,6 +446,7 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
         checks.check_is_not_normalized(vec_env)
         check_for_correct_spaces(vec_env, self.observation_space, self.action_space)
         if vec_env.has_attr("task_family"):
+            checks.get_max_episode_steps(vec_env)
             if task is None:
                 vec_env.reset()
                 task = np.array(vec_env.get_attr("task")[0])
@@ -461,6 +462,8 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
             episode = adaptation.n_episodes[0] - step.dones[0]
             returns[episode] += step.rewards[0]
             successes[episode] |= step.infos[0].get("is_success", adaptation.task_reward[0] > 0)
+        if task is not None and np.ndim(task) > 0:
+            checks.check_tasks(vec_env, np.asarray(task, dtype=np.float32)[None])
         if adaptation.best_return[0] <= 0 and self.knowledge.tells_success:
             warnings.warn(
                 f"No reward was found in {n_episodes} episodes, so the agent is not adapted: allow more, or train longer.",

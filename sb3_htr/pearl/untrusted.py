@@ -13,6 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_htr.common.plain import MAX_BYTES, load_plain
+from sb3_htr.common.saving import with_suffix
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.pearl.pearl import PEARL
 from sb3_htr.pearl.policies import PEARLPolicy
@@ -54,6 +55,7 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
     :return: a model to predict, adapt and evaluate with
     :raises ValueError: if it is no such file, or its weights do not fit
     """
+    path = with_suffix(path, ".zip")
     try:
         data, weights = _read(path)
         settings: dict[str, Any] = {name: _plain(data[name]) for name in EXPLORERS}
@@ -67,6 +69,8 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
             raise ValueError(f"PEARL has no contexts of {settings['context_size']} steps here.")
         counters = {name: data[name] for name in COUNTERS if type(data.get(name)) is int}
         settings["policy_kwargs"] = _policy_kwargs(data.get("policy_kwargs", {}))
+    except FileNotFoundError:
+        raise
     except Exception as error:  # whatever a stranger can put into a file
         why = f": {error}" if isinstance(error, ValueError) and "PEARL" in str(error) else "."
         raise ValueError(f"{path} is damaged, or no model saved by PEARL: nothing of it was loaded{why}") from None

@@ -82,6 +82,8 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--method")
     parser.add_argument("-params", "--hyperparams", nargs="+")
     parser.add_argument("--env-kwargs", nargs="+")
+    parser.add_argument("--gym-packages", nargs="+")
+    parser.add_argument("-conf", "--conf-file", nargs=1)
     args, _ = parser.parse_known_args(argv)
     if args.storage and not args.study_name:
         raise ValueError(
@@ -104,7 +106,8 @@ def main(argv: Sequence[str]) -> None:
     else:
         command = ["sb3-htr", "train", "--env", args.env, *(["--method", args.method] if args.method else [])]
         command += ["--study-name", args.study_name, "--storage", args.storage, "--trial-id", str(study.best_trial.number)]
-        for option, values in (("--env-kwargs", args.env_kwargs), ("-params", args.hyperparams)):
+        given = {"--gym-packages": args.gym_packages, "-conf": args.conf_file, "--env-kwargs": args.env_kwargs}
+        for option, values in {**given, "-params": args.hyperparams}.items():
             command += [option, *values] if values else []
         print(f"Train with the best trial so far: {shlex.join(command)}")
 

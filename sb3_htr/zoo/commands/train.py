@@ -1,6 +1,7 @@
 """``sb3-htr train``: rl_zoo3's training with the algorithm of a method in it, and with evaluations that adapt."""
 
 import argparse
+import traceback
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -98,6 +99,9 @@ def main(argv: Sequence[str]) -> None:
     try:
         run_rl_zoo(program, algorithm, [*default_arguments(algorithm), *given], args.method, run, args.trust)
     except (NameError, SyntaxError) as error:
+        # Text that rl_zoo3 evaluates, and no code of an env
+        if isinstance(error, NameError) and traceback.extract_tb(error.__traceback__)[-1].filename != "<string>":
+            raise
         raise ValueError(
             f"{error}: the values of -params and --env-kwargs are Python, with strings in quotes, as in \"explorer:'prior'\"."
         ) from error

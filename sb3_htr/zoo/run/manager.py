@@ -102,8 +102,14 @@ class MetaExperimentManager(ExperimentManager):
         return hyperparams, saved
 
     def _trial(self, trial_id: int | None) -> dict[str, Any]:
-        if not (self.storage and self.study_name and trial_id is not None):
+        named = {"--storage": self.storage, "--study-name": self.study_name, "--trial-id": trial_id}
+        missing = [option for option, value in named.items() if value is None]
+        if len(missing) == 3 or self.optimize_hyperparameters:
             return {}
+        if missing or trial_id is None or trial_id < 0:
+            add = ", ".join(missing) or "another number"
+            raise ValueError(f"A trial is named by {', '.join(named)}, from 0 on: add {add}.")
+        assert self.storage is not None and self.study_name is not None
         try:
             trial: dict[str, Any] = self.load_trial(self.storage, self.study_name, trial_id)
         except (KeyError, IndexError):
