@@ -55,7 +55,8 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
     :return: a model to predict, adapt and evaluate with
     :raises ValueError: if it is no such file, or its weights do not fit
     """
-    path = with_suffix(path, ".zip")
+    # As SB3's load does
+    path = path if os.path.exists(path) else with_suffix(path, ".zip")
     try:
         data, weights = _read(path)
         settings: dict[str, Any] = {name: _plain(data[name]) for name in EXPLORERS}
