@@ -19,7 +19,7 @@ $(STAMP): setup.cfg constraints.txt
 	@touch $@
 
 demo: $(STAMP) ## meta-train on SparsePointRobot-v0, then adapt to unseen tasks
-	$(BIN)/sb3-htr train --env SparsePointRobot-v0 -n 28000 -P --verbose 0 --eval-freq 4000 -f runs/demo
+	$(BIN)/sb3-htr train --env SparsePointRobot-v0 -n 24000 -P --verbose 0 --eval-freq 4000 -f runs/demo
 	$(BIN)/sb3-htr evaluate runs/demo
 	$(BIN)/sb3-htr plot runs/demo --only learning -o runs/demo
 
