@@ -66,7 +66,13 @@ class AdaptationRecord(NamedTuple):
 
 
 def run_adaptation(
-    policy: BasePolicy, env: VecEnv, adaptation: Adapts, n_episodes: int, deterministic: bool = True, seed: int = 0
+    policy: BasePolicy,
+    env: VecEnv,
+    adaptation: Adapts,
+    n_episodes: int,
+    deterministic: bool = True,
+    seed: int = 0,
+    obs: Any = None,
 ) -> AdaptationRecord:
     """
     Run ``n_episodes`` episodes of each env, from a reset on.
@@ -77,6 +83,7 @@ def run_adaptation(
     :param n_episodes: episodes per env
     :param deterministic: mean actions instead of samples
     :param seed: seed of sampled actions; the random state of training is left alone
+    :param obs: (n_envs, obs_dim) of a reset that was done; by default, one is done here
     :return: one row per env
     :raises ValueError: if there are no episodes
     """
@@ -92,7 +99,7 @@ def run_adaptation(
     with th.random.fork_rng(enabled=not deterministic):
         if not deterministic:
             th.manual_seed(seed)
-        for step in adaptation_steps(env, adaptation, n_episodes, policy.unscale_action, act):
+        for step in adaptation_steps(env, adaptation, n_episodes, policy.unscale_action, act, obs):
             # Envs that are ahead of the others write to a column that is cut off
             column = np.minimum(episode, n_episodes)
             returns[envs, column] += step.rewards
@@ -154,9 +161,10 @@ def record_adaptation(
         # Envs without a task of their own repeat the last one
         index = np.minimum(np.arange(first, first + env.num_envs), len(tasks) - 1)
         env.set_options([{"task": task} for task in tasks[index]])
-        adaptation = model.start_adaptation(env.num_envs, explorer, generator)
-        record = run_adaptation(model.policy, env, adaptation, n_episodes, deterministic, seed + first)
+        obs = env.reset()
         check_tasks(env, tasks[index])
+        adaptation = model.start_adaptation(env.num_envs, explorer, generator)
+        record = run_adaptation(model.policy, env, adaptation, n_episodes, deterministic, seed + first, obs)
         records.append([values[: len(tasks) - first] for values in record])
     length = max(achieved.shape[2] for _, _, achieved in records)
     for record_ in records:
