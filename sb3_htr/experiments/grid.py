@@ -8,6 +8,7 @@ from typing import Any
 from sb3_htr.experiments import figures
 from sb3_htr.experiments.ablations import ABLATIONS
 from sb3_htr.experiments.cell import Cell, Evaluation, KwArgs
+from sb3_htr.zoo.run.agents import WRAPPERS
 from sb3_htr.zoo.run.method import get_method
 
 EXPLORERS = ("belief", "learned-prior", "aggregate", "prior")
@@ -33,6 +34,7 @@ class Variant:
     :param settings: hyperparameters, joined with those of env and method
     :param env_kwargs: arguments of the env
     :param budget: times the env steps of the experiment
+    :raises ValueError: for wrappers among the settings
     """
 
     method: str
@@ -40,6 +42,13 @@ class Variant:
     settings: KwArgs = field(default_factory=dict)
     env_kwargs: KwArgs = field(default_factory=dict)
     budget: float = 1.0
+
+    def __post_init__(self) -> None:
+        if wrappers := [name for name in WRAPPERS if name in self.settings]:
+            raise ValueError(
+                f"An experiment has no {wrappers[0]}, as its final models are evaluated in the env of its id: register the "
+                "wrapped env under an id of its own."
+            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -98,10 +98,10 @@ def test_the_command_repeats_an_experiment(
     assert {path.name for path in results.iterdir()} == {"tiny.png", "reliability.png", "raw.npz", "summary.json"}
     summary = json.loads((results / "summary.json").read_text())
     assert summary["command"] == "sb3-htr experiment tiny --quick", "what repeats these results"
-    coarse, plain = (agent_at(cell.run_folder(runs)) for cell in experiment.cells(1, 0.1))
+    coarse, plain = (agent_at(cell.run_folder(runs), trust=True) for cell in experiment.cells(1, 0.1))
     assert (coarse.method, plain.method) == ("htr-ec", "pearl-sparse-prior")
     assert coarse.record["env_kwargs"] == {"goal_distance": 0.5, "n_test_tasks": 4} and coarse.record["n_timesteps"] == 960
-    trained = coarse.load(trust=True)
+    trained = coarse.load()
     assert isinstance(trained, PEARL)
     relabeller: Any = trained.replay_buffer_kwargs["relabeller"]
     assert relabeller["name"] == "EpisodeClustering" and relabeller["cell_size"] == 0.3

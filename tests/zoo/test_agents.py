@@ -21,6 +21,7 @@ from sb3_htr import PEARL, load_untrusted
 from sb3_htr.adaptation.evaluation import AdaptationRecord, record_adaptation
 from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.experiments.grid import Variant
 from sb3_htr.zoo import cli
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run import model_card
@@ -106,6 +107,33 @@ def test_export_is_small_exact_and_plain(run: Path, tmp_path: Path, tiny_pearl: 
     # A start for a training of one's own
     exported = PEARL.load(file, env=model.env)
     exported.learn(500)
+
+
+@pytest.mark.parametrize(
+    ("setting", "name"),
+    [
+        ("env_wrapper", "gymnasium.wrappers.RecordEpisodeStatistics"),
+        ("vec_env_wrapper", "stable_baselines3.common.vec_env.VecCheckNan"),
+    ],
+)
+def test_an_agent_is_tested_in_the_wrappers_of_its_training(
+    setting: str, name: str, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record = json.loads((run / RECORD).read_text())
+    (run / RECORD).write_text(json.dumps({**record, "hyperparams": {setting: name}}))
+    few = ["--n-episodes", "1"]
+    with pytest.raises(ValueError, match=f"has {setting}: '{name}', which can run any code: add --trust"):
+        main(["evaluate", str(run), *few])
+    module, _, of_class = name.rpartition(".")
+    made: list[Any] = []
+    monkeypatch.setattr(sys.modules[module], of_class, lambda env: made.append(env) or env)  # type: ignore[func-returns-value]
+    for arguments in (["evaluate", str(run)], ["export", str(run), "-o", str(tmp_path / "agent")], ["enjoy", str(run)]):
+        made.clear()
+        more = ["--no-render", "--n-tasks", "1"] if arguments[0] == "enjoy" else []
+        assert main([*arguments, *more, *few, "--trust"]) == 0
+        assert made, arguments
+    with pytest.raises(ValueError, match=f"An experiment has no {setting}"):
+        Variant("htr-ser", settings={setting: name})
 
 
 def test_a_model_of_another_version_is_said_to_be_one(tmp_path: Path, tiny_pearl: MakePEARL) -> None:

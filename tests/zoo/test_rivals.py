@@ -47,8 +47,8 @@ def test_all_commands_take_them(method: str, runs: Path, tmp_path: Path, capsys:
     run = run_folder(runs, method)
     assert json.loads((run / RECORD).read_text())["method"] == method
     # Without pickle, as with it
-    agent = agent_at(run, "last")
-    records = [evaluate_adaptation(agent.load(trust=trust), ENV_ID, n_episodes=2) for trust in (False, True)]
+    agents = [agent_at(run, "last", trust=trust) for trust in (False, True)]
+    records = [evaluate_adaptation(agent.load(), ENV_ID, n_episodes=2) for agent in agents]
     np.testing.assert_array_equal(records[0], records[1])
     few = ["--n-episodes", "2"]
     assert main(["evaluate", str(run), "-o", str(tmp_path), *few, "--tasks", "validation"]) == 0

@@ -115,7 +115,7 @@ def chosen_agent(parser: argparse.ArgumentParser, args: argparse.Namespace, path
     check_env_kwargs(agent.record["env_kwargs"], agent.path, args.trust, args.gym_packages)
     find_hidden(agent.env_id)
     kwargs = {**agent.record["env_kwargs"], **args.env_kwargs}
-    return dataclasses.replace(agent, record={**agent.record, "env_kwargs": kwargs})
+    return dataclasses.replace(agent, record={**agent.record, "env_kwargs": kwargs}, trusted=args.trust)
 
 
 def parse(parser: argparse.ArgumentParser, argv: Sequence[str]) -> tuple[argparse.Namespace, TrainedAgent]:

@@ -46,9 +46,9 @@ def watch(agent: TrainedAgent, args: argparse.Namespace, every: int, show: Show)
     :return: last moment of each task
     :raises ValueError: for a task or a number of episodes that there is not
     """
-    model = agent.load(args.device, args.trust)
+    model = agent.load(args.device)
     env = agent.make_env("rgb_array" if every else None)
-    player = Player(model, env, args.explorer, not args.stochastic, args.seed, every)
+    player = Player(model, env, args.explorer, not args.stochastic, args.seed, every, agent.around)
     tasks: np.ndarray = getattr(get_task_family(player.vec_env), f"{args.tasks}_tasks")
     infinity = float("inf")
     check_numbers(**{"--n-episodes": (args.n_episodes, 1, infinity), "--n-tasks": (args.n_tasks, 1, infinity)})

@@ -39,7 +39,7 @@ def main(argv: Sequence[str]) -> None:
     add_adaptation_arguments(parser, n_episodes=20)
     parser.add_argument("-o", "--output", type=Path, help="folder for the files (default: the run folder, or ./ENV_ID)")
     args, agent = parse(parser, argv)
-    model = agent.load(args.device, args.trust)
+    model = agent.load(args.device)
     env = agent.make_vec_env(20)
     family = get_task_family(env)
     tasks = getattr(family, f"{args.tasks}_tasks")

@@ -1,5 +1,6 @@
 """``sb3-htr export``: a small file to share, and what to say about it."""
 
+import dataclasses
 import json
 import zipfile
 from collections.abc import Sequence
@@ -26,7 +27,7 @@ ALSO_KEPT = ("observation_space", "action_space", "policy_class", "n_envs", "num
 KEPT_OF_RECORD = ("env_id", "method", "env_kwargs", "gym_packages", "seed", "n_timesteps", "hyperparams", "versions")
 
 
-def export(agent: TrainedAgent, path: Path, trust: bool = False) -> dict[str, Any]:
+def export(agent: TrainedAgent, path: Path) -> dict[str, Any]:
     """
     Write a model file without optimizer states, replay, statistics of training and local paths. ``load`` of its class reads
     it, and the commands find in it which env it is for. What acts is exact; the critics of SAC, whose values only rank
@@ -34,10 +35,9 @@ def export(agent: TrainedAgent, path: Path, trust: bool = False) -> dict[str, An
 
     :param agent: to export
     :param path: file to write
-    :param trust: see :meth:`TrainedAgent.load`
     :return: its record
     """
-    model = agent.load(trust=trust)
+    model = agent.load()
     for name in model._get_torch_save_params()[0]:
         if name.endswith("optimizer"):
             attrgetter(name)(model).state.clear()
@@ -96,7 +96,7 @@ def main(argv: Sequence[str]) -> None:
     name = model_name(agent.env_id, agent.algorithm.name)
     left = [] if alone else earlier_export(output, files(name))
     file = output if alone else output / f"{name}.zip"
-    record = export(agent, file, args.trust)
+    record = export(agent, file)
     # Not before the model is written: it may be the one that is exported
     for path in left:
         if path != file:
@@ -104,8 +104,8 @@ def main(argv: Sequence[str]) -> None:
     print(f"{file}: {file.stat().st_size / 1e6:.2f} MB, of {agent.path}")
     if alone:
         return
-    exported = TrainedAgent(file, record, None)
-    model, env = exported.load(trust=args.trust), exported.make_vec_env(20)
+    exported = dataclasses.replace(agent, path=file, record=record, folder=None)
+    model, env = exported.load(), exported.make_vec_env(20)
     tasks = get_task_family(env).test_tasks
     explorers = dict.fromkeys([model.explorer.name, *exported.algorithm.also_explores_by])
     scores = {explorer: record_adaptation(model, env, tasks, args.n_episodes, explorer=explorer) for explorer in explorers}

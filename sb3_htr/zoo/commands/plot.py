@@ -69,7 +69,7 @@ def adapt(agent: TrainedAgent, args: argparse.Namespace) -> Adapted:
     :return: what happened
     """
     print(f"Adapting {agent.path}")
-    model = agent.load(args.device, args.trust)
+    model = agent.load(args.device)
     family = get_task_family(agent.make_vec_env(1))
     tasks: np.ndarray = getattr(family, f"{args.tasks}_tasks")
     env = agent.make_vec_env(len(tasks))

@@ -4,12 +4,14 @@ import contextlib
 import json
 import os
 import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
 import gymnasium as gym
 import torch as th
+from rl_zoo3.utils import get_wrapper_class
 from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -19,11 +21,14 @@ from sb3_htr.zoo.run.algorithm import Algorithm, Model
 from sb3_htr.zoo.run.folder import run_number
 from sb3_htr.zoo.run.method import DEFAULT, OWN, get_method, methods
 from sb3_htr.zoo.run.shipped import shipped
+from sb3_htr.zoo.run.trust import refuse
 
 # Record of a run: in its folder, and in an exported model file
 RECORD = "run.json"
 # Its bytes, at most
 MAX_RECORD = 2**20
+# rl_zoo3's, of single envs and of their batch
+WRAPPERS = ENV_WRAPPER, VEC_ENV_WRAPPER = "env_wrapper", "vec_env_wrapper"
 # What it must say, and what it may say for training on and for model cards
 REQUIRED = {"env_id": str, "env_kwargs": dict, "gym_packages": list}
 OF_TRAINING = {"arguments": list, "n_timesteps": int, "seed": int, "method": str, "hyperparams": dict}
@@ -35,11 +40,13 @@ class TrainedAgent:
     :param path: model file
     :param record: of its training: ``env_id``, ``method``, ``env_kwargs``, ``gym_packages``
     :param folder: run folder, None for a model file of its own
+    :param trusted: whether its files may have code run, which networks, explorers and wrappers of one's own need
     """
 
     path: Path
     record: dict[str, Any]
     folder: Path | None
+    trusted: bool = False
 
     @property
     def env_id(self) -> str:
@@ -67,11 +74,9 @@ class TrainedAgent:
         explorer = self.record.get("hyperparams", {}).get("explorer", OWN)
         return str(explorer["name"] if isinstance(explorer, dict) else explorer)
 
-    def load(self, device: str = "cpu", trust: bool = False) -> Model:
+    def load(self, device: str = "cpu") -> Model:
         """
         :param device: torch device
-        :param trust: unpickle all of the file, as ``load`` of the class does, which can run any code; needed for networks and
-            explorers of one's own
         :return: the model
         :raises ValueError: for a device that cannot be used, or a model whose networks are not those of this version
         """
@@ -80,7 +85,7 @@ class TrainedAgent:
         except (RuntimeError, AssertionError, NotImplementedError):
             raise ValueError(f"The device {device!r} cannot be used: give cpu, cuda or cuda:N.") from None
         try:
-            return self.algorithm.load(self.path, self.record, self.make_env(), device, trust)
+            return self.algorithm.load(self.path, self.record, self.make_env(), device, self.trusted)
         except RuntimeError as error:
             writer = self.record.get("versions", {}).get("sb3_htr", "unknown")
             reason = str(error).splitlines()[-1].strip()[:200]
@@ -96,8 +101,9 @@ class TrainedAgent:
         """
         # An env that cannot be drawn need not know the argument
         drawn: dict[str, Any] = {} if render_mode is None else {"render_mode": render_mode}
+        wrap = self._wrapper(ENV_WRAPPER) or (lambda env: env)
         try:
-            return gym.make(self.env_id, **self.record["env_kwargs"], **drawn)
+            return wrap(gym.make(self.env_id, **self.record["env_kwargs"], **drawn))
         except TypeError as error:
             if not drawn or "'render_mode'" not in str(error):
                 raise
@@ -108,9 +114,27 @@ class TrainedAgent:
     def make_vec_env(self, n_envs: int) -> VecEnv:
         """
         :param n_envs: number of envs
-        :return: the envs
+        :return: the envs, in the wrappers that they had in training
         """
-        return make_task_vec_env(self.env_id, n_envs, env_kwargs=self.record["env_kwargs"])
+        wrapper = self._wrapper(ENV_WRAPPER)
+        return self.around(make_task_vec_env(self.env_id, n_envs, env_kwargs=self.record["env_kwargs"], wrapper=wrapper))
+
+    def around(self, env: VecEnv) -> VecEnv:
+        """
+        :param env: of single envs as :meth:`make_env` makes them
+        :return: the same in the wrapper that the batch had in training, if it had one
+        """
+        wrap: Callable[[VecEnv], VecEnv] | None = self._wrapper(VEC_ENV_WRAPPER)
+        return env if wrap is None else wrap(env)
+
+    def _wrapper(self, name: str) -> Callable[[Any], Any] | None:
+        """Of a setting of rl_zoo3."""
+        hyperparams = self.record.get("hyperparams", {})
+        if hyperparams.get(name) is None:
+            return None
+        if not self.trusted:
+            raise refuse(self.path, f"has {name}: {hyperparams[name]!r}")
+        return cast(Callable[[Any], Any], get_wrapper_class(hyperparams, name))
 
 
 def file_stem(env_id: str) -> str:
@@ -178,11 +202,14 @@ def find_model(run: Path, env_id: str, which: str) -> Path:
     )
 
 
-def agent_at(path: str | os.PathLike[str], which: str = "best", env_id: str | None = None) -> TrainedAgent:
+def agent_at(
+    path: str | os.PathLike[str], which: str = "best", env_id: str | None = None, trust: bool = False
+) -> TrainedAgent:
     """
     :param path: a run folder, a folder of runs, of which the newest is meant, an exported folder, or a model file
     :param which: ``"best"`` or ``"last"`` model of a run
     :param env_id: env of a model file without a record
+    :param trust: whether its files may have code run
     :return: the agent
     :raises FileNotFoundError: if there is none
     :raises ValueError: if it is no model file, or one that does not say its env
@@ -194,7 +221,7 @@ def agent_at(path: str | os.PathLike[str], which: str = "best", env_id: str | No
     if path.is_dir():
         run = find_run(path)
         record = read_record(run / RECORD)
-        return TrainedAgent(find_model(run, record["env_id"], which), record, run)
+        return TrainedAgent(find_model(run, record["env_id"], which), record, run, trust)
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist: give a run folder, a folder of runs, or a model file (.zip).")
     names: list[str] = []
@@ -203,14 +230,14 @@ def agent_at(path: str | os.PathLike[str], which: str = "best", env_id: str | No
         if RECORD in names and archive.getinfo(RECORD).file_size > MAX_RECORD:
             raise ValueError(f"The {RECORD} in {path} unpacks to more than {MAX_RECORD} bytes, which no training writes.")
         if RECORD in names:
-            return TrainedAgent(path, read_record(path, archive.read(RECORD)), None)
+            return TrainedAgent(path, read_record(path, archive.read(RECORD)), None, trust)
     if "data" not in names:
         raise ValueError(f"{path} is no model file: give a run folder, or a .zip that a training has saved.")
     if (path.parent / RECORD).exists():
-        return TrainedAgent(path, read_record(path.parent / RECORD), path.parent)
+        return TrainedAgent(path, read_record(path.parent / RECORD), path.parent, trust)
     if env_id is None:
         raise ValueError(f"{path} does not say which env it was trained on: add --env ID.")
-    return TrainedAgent(path, {"env_id": env_id, "env_kwargs": {}, "gym_packages": []}, None)
+    return TrainedAgent(path, {"env_id": env_id, "env_kwargs": {}, "gym_packages": []}, None, trust)
 
 
 def agent_for(

@@ -1,6 +1,6 @@
 """An adaptation to one task, step by step, for those who watch it."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_htr.adaptation.evaluation import MetaLearner
 from sb3_htr.adaptation.loop import adaptation_steps
@@ -97,6 +97,7 @@ class Player:
     :param deterministic: mean actions instead of samples
     :param seed: of env and z
     :param every: takes every N-th frame of an episode, and the last one; 0 takes none
+    :param around: puts wrappers around the VecEnv that the env is in
     """
 
     def __init__(
@@ -107,10 +108,11 @@ class Player:
         deterministic: bool = True,
         seed: int = 0,
         every: int = 0,
+        around: Callable[[VecEnv], VecEnv] = lambda env: env,
     ) -> None:
         self.model, self.explorer, self.deterministic = model, explorer, deterministic
         self.camera = Camera(env, every)
-        self.vec_env = DummyVecEnv([lambda: self.camera])
+        self.vec_env = around(DummyVecEnv([lambda: self.camera]))
         self.vec_env.seed(seed)
         self.generator = th.Generator().manual_seed(seed)
         # Of sampled actions
