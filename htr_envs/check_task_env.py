@@ -132,14 +132,15 @@ def _play(
 ) -> Episode:
     action_space = copy.deepcopy(env.action_space)
     action_space.seed(seed)
-    observation, info = env.reset(seed=seed, options=None if task is None else {"task": task})
+    options = None if task is None else {"task": task}
+    observation, info = _call("The env fails in a reset.", lambda: env.reset(seed=seed, options=options))
     _require(type(info.get("task_id")) is int, "The info of reset lacks `task_id`, or it is no int.")
     task_id: int = info["task_id"]
     rows: list[tuple[Any, ...]] = []
     done = False
     while not done and len(rows) < (MAX_STEPS if actions is None else len(actions)):
         action = action_space.sample() if actions is None else actions[len(rows)]
-        next_observation, reward, terminated, truncated, info = env.step(action)
+        next_observation, reward, terminated, truncated, info = _call("The env fails in a step.", env.step, action)
         _check_step(env, family, next_observation, reward, info)
         _require(info["task_id"] == task_id, f"The task changed within an episode, from {task_id} to {info['task_id']}.")
         free, success, achieved_task = (info.get(key) for key in ("task_free_reward", "is_success", "achieved_task"))

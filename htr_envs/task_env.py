@@ -155,6 +155,15 @@ class TaskFamily(TaskDistribution):
         """
 
 
+def _of_one_step(name: str, values: Any) -> Any:
+    if np.shape(values) != (1,):
+        raise ValueError(
+            f"{name} of the task family returned shape {np.shape(values)} for a trajectory of one step, expected (1,): one "
+            "value for each step."
+        )
+    return values[0]
+
+
 class TaskEnv(MetaEnv):
     """An environment whose reward depends on a task that the observation never shows.
 
@@ -202,10 +211,10 @@ class TaskEnv(MetaEnv):
         assert before is not None and after is not None
         # one reward function for step and for relabelling: compute_reward gives step's rewards again, bit for bit
         traj = Trajectory(before[None], action[None], after[None], np.array([task_free_reward], np.float32))
-        reward = float(self.compute_reward(traj, self.task)[0])
+        reward = float(_of_one_step("compute_reward", self.compute_reward(traj, self.task)))
         info = {
             "task_id": self.task_id,
-            "is_success": bool(self.task_family.is_success(traj, self.task)[0]),
+            "is_success": bool(_of_one_step("is_success", self.task_family.is_success(traj, self.task))),
             "achieved_task": self.hindsight_task(traj, 0),
             "task_free_reward": float(traj.task_free_reward[0]),
         }

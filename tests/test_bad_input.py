@@ -1,6 +1,7 @@
 """Envs and settings that cannot work are refused in one sentence, before any work is lost."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,12 @@ from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL, many
-from htr_envs import PointRobotEnv, PointRobotVectorEnv
+from htr_envs import PointRobotEnv, PointRobotVectorEnv, check_task_env
 from sb3_htr import PEARL, evaluate_adaptation, load_untrusted
 from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
+from sb3_htr.rivals.rl2 import RL2
+from sb3_htr.rivals.scripted import ScriptedAgent
 from sb3_htr.zoo.cli import main
 
 
@@ -324,6 +327,10 @@ def test_only_the_envs_of_a_model_can_be_adapted_to(tiny_pearl: MakePEARL) -> No
     for other in ("CartPole-v1", "SparseTargetSpeed-v0"):
         with pytest.raises(ValueError, match="spaces do not match"):
             model.adapt(gym.make(other))
+    for agent in (model, RL2("MlpLstmPolicy", ENV_ID), ScriptedAgent.random(spaces.Box(-2, 2, (2,)))):
+        other = ENV_ID if isinstance(agent, ScriptedAgent) else "SparseTargetSpeed-v0"
+        with pytest.raises(ValueError, match="spaces do not match"):
+            evaluate_adaptation(agent, other, n_episodes=1)
 
 
 numbers = st.one_of(st.integers(-3, 300), st.floats(-2, 2), st.just(float("nan")), st.just(float("inf")))
@@ -361,9 +368,47 @@ def test_an_env_that_is_on_other_tasks_than_asked_for_is_refused(tiny_pearl: Mak
         lambda: tiny_pearl(env).learn(ROLLOUT),
         lambda: evaluate_adaptation(model, env, n_episodes=1),
         lambda: model.adapt(env, n_episodes=1, task=test[0]),
+        lambda: model.adapt(env, n_episodes=1, task=41),
     ):
         with pytest.raises(ValueError, match=r"The env was asked for the task.* must hand on options"):
             act()
+
+
+def test_envs_of_several_families_are_refused(tiny_pearl: MakePEARL) -> None:
+    """All experience would be relabelled by the rewards of the first one."""
+    env = DummyVecEnv([partial(gym.make, ENV_ID, goal_radius=radius) for radius in (0.2, 0.2, 0.3)])
+    with pytest.raises(ValueError, match=r"Env 2 .* has another task family: its goal_radius is 0.3, that of the first one"):
+        tiny_pearl(env)
+    with pytest.raises(ValueError, match="another task family"):
+        evaluate_adaptation(tiny_pearl(), env, n_episodes=1)
+
+
+class WithoutSuccess(gym.Wrapper[Any, Any, Any, Any]):
+    def step(self, action: Any) -> Any:
+        *result, info = self.env.step(action)
+        return *result, {key: value for key, value in info.items() if key != "is_success"}
+
+
+def test_an_env_that_does_not_tell_its_successes_is_named(tiny_pearl: MakePEARL) -> None:
+    env = make_task_vec_env(ENV_ID, 2, wrapper=WithoutSuccess)
+    with pytest.raises(ValueError, match=r"The env's step returns no info\['is_success'\], though its task family tells"):
+        tiny_pearl(env).learn(1)
+
+
+class OneForAll(type(get_task_family(make_task_vec_env(ENV_ID)))):  # type: ignore[misc]
+    def compute_reward(self, *args: Any, **kwargs: Any) -> Any:
+        return super().compute_reward(*args, **kwargs).mean()
+
+
+def test_a_reward_hook_of_another_shape_is_named() -> None:
+    env = gym.make(ENV_ID)
+    env.unwrapped.task_family = OneForAll()  # type: ignore[attr-defined]
+    env.reset(seed=0)
+    sentence = r"compute_reward of the task family returned shape \(\) for a trajectory of one step, expected \(1,\)"
+    with pytest.raises(ValueError, match=sentence):
+        env.step(env.action_space.sample())
+    with pytest.raises(AssertionError, match=rf"The env fails in a step\. .*{sentence}"):
+        check_task_env(env)
 
 
 @pytest.mark.parametrize("explorer", ["belief", "prior", "aggregate", "learned-prior"])

@@ -13,7 +13,6 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_htr.adaptation.loop import Adapts, Watched, adaptation_steps
 from sb3_htr.common.checks import (
     check_is_no_gymnasium_vector_env,
-    check_is_not_normalized,
     check_numbers,
     check_tasks,
     get_max_episode_steps,
@@ -42,6 +41,10 @@ class MetaLearner(Protocol):
     @property
     def explorer(self) -> Named:
         """How it explores unless told otherwise."""
+        ...
+
+    def check_env(self, env: VecEnv) -> None:
+        """Refuse an env that it cannot act in."""
         ...
 
     def start_adaptation(self, n_envs: int, explorer: Any = None, generator: th.Generator | None = None) -> Watched:
@@ -149,7 +152,7 @@ def record_adaptation(
         env = make_task_vec_env(env, max(n_tasks, 1), seed)
     elif isinstance(env, gym.Env):
         env = BaseAlgorithm._wrap_env(env, monitor_wrapper=False)
-    check_is_not_normalized(env)
+    model.check_env(env)
     tasks = get_task_family(env).test_tasks if tasks is None else np.asarray(tasks, dtype=np.float32)
     if tasks.ndim != 2 or len(tasks) == 0:
         raise ValueError(f"tasks have shape {tasks.shape}, expected (n_tasks, task_dim) with at least one task.")
@@ -196,7 +199,7 @@ def evaluate_adaptation(
     :param deterministic: mean actions instead of samples
     :param seed: seed of env, z and sampled actions; the random state of training is left alone
     :return: returns and successes, (n_tasks, n_episodes) each
-    :raises ValueError: if there are no tasks or episodes, or the env has no task family
+    :raises ValueError: if there are no tasks or episodes, or the env has no task family, or other spaces than in training
     """
     record = record_adaptation(model, env, tasks, n_episodes, explorer, deterministic, seed)
     return record.returns, record.successes

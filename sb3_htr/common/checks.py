@@ -130,10 +130,14 @@ def get_task_family(env: VecEnv) -> TaskFamily:
     """
     :param env: env to train on
     :return: its task family
-    :raises ValueError: if it has none
+    :raises ValueError: if it has none, or its envs have several
     """
     check_has_task_family(env.has_attr("task_family"))
-    family: TaskFamily = env.get_attr("task_family")[0]
+    family: TaskFamily
+    family, *others = env.get_attr("task_family")
+    for i, other in enumerate(others, start=1):
+        if other is not family:
+            check_same_family(family_facts(family), family_facts(other), f"Env {i} of the VecEnv", "the first one")
     if not hasattr(family, "train_tasks"):
         raise ValueError(f"The env's task_family has no train_tasks to meta-train on: {TASK_ENV_ADVICE}.")
     return family
@@ -195,19 +199,20 @@ def family_facts(family: TaskFamily) -> dict[str, str]:
     return {"class": type(family).__qualname__, **{name: fact(value) for name, value in sorted(attributes.items())}}
 
 
-def check_same_family(before: dict[str, str], now: dict[str, str], what: str) -> None:
+def check_same_family(before: dict[str, str], now: dict[str, str], what: str, known: str = "the collected experience") -> None:
     """
     :param before: :func:`family_facts` of what was collected
     :param now: of what comes in
     :param what: comes in, for the message
+    :param known: what it is compared with, for the message
     :raises ValueError: if they differ, naming the first difference
     """
     different = [name for name in {**before, **now} if before.get(name) != now.get(name)]
     if different:
         name = different[0]
         raise ValueError(
-            f"{what} has another task family: its {name} is {now.get(name)}, that of the collected experience is "
-            f"{before.get(name)}. Relabelled rewards would be wrong: make a new model."
+            f"{what} has another task family: its {name} is {now.get(name)}, that of {known} is {before.get(name)}. "
+            "Relabelled rewards would be wrong: make all envs of a model alike, or make a new model."
         )
 
 

@@ -130,6 +130,16 @@ class PatientResultsWriter(ResultsWriter):
 class TaskVecMonitor(VecMonitor):
     """SB3's monitor, of which a deep copy can be made; the copy writes no file."""
 
+    def step_wait(self) -> VecEnvStepReturn:
+        try:
+            return super().step_wait()
+        except KeyError as missing:
+            if missing.args[0] not in self.info_keywords:
+                raise
+            raise ValueError(
+                f"The env's step returns no info[{missing}], though its task family tells successes: add it to the info."
+            ) from None
+
     def __deepcopy__(self, memo: dict[int, Any]) -> "TaskVecMonitor":
         shared: dict[str, Any] = {"class_attributes": self.class_attributes, "results_writer": None}
         result = memo[id(self)] = type(self).__new__(type(self))

@@ -394,6 +394,14 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
 
     # Meta-test
 
+    def check_env(self, env: VecEnv) -> None:
+        """
+        :param env: to adapt in
+        :raises ValueError: if its spaces are not those of training, or it normalizes
+        """
+        checks.check_is_not_normalized(env)
+        check_for_correct_spaces(self._wrap_env(env), self.observation_space, self.action_space)
+
     def start_adaptation(
         self,
         n_envs: int,
@@ -443,8 +451,7 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
         vec_env = self._wrap_env(make_task_vec_env(env) if isinstance(env, str) else env, monitor_wrapper=False)
         if vec_env.num_envs != 1:
             raise ValueError(f"adapt() adapts to one task, but the VecEnv has {vec_env.num_envs} envs: pass a single env.")
-        checks.check_is_not_normalized(vec_env)
-        check_for_correct_spaces(vec_env, self.observation_space, self.action_space)
+        self.check_env(vec_env)
         if vec_env.has_attr("task_family"):
             checks.get_max_episode_steps(vec_env)
             if task is None:
@@ -458,12 +465,15 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
         adaptation = self.start_adaptation(1, explorer, th.Generator().manual_seed(seed))
         returns, successes = np.zeros(n_episodes), np.zeros(n_episodes, dtype=bool)
         act = partial(adaptation.act, deterministic=deterministic)
-        for step in adaptation_steps(vec_env, adaptation, n_episodes, self.policy.unscale_action, act):
+        obs = vec_env.reset()
+        if task is not None and np.ndim(task) > 0:
+            checks.check_tasks(vec_env, np.asarray(task, dtype=np.float32)[None])
+        elif task is not None:
+            checks.check_task_ids(vec_env, np.atleast_1d(task))
+        for step in adaptation_steps(vec_env, adaptation, n_episodes, self.policy.unscale_action, act, obs):
             episode = adaptation.n_episodes[0] - step.dones[0]
             returns[episode] += step.rewards[0]
             successes[episode] |= step.infos[0].get("is_success", adaptation.task_reward[0] > 0)
-        if task is not None and np.ndim(task) > 0:
-            checks.check_tasks(vec_env, np.asarray(task, dtype=np.float32)[None])
         if adaptation.best_return[0] <= 0 and self.knowledge.tells_success:
             warnings.warn(
                 f"No reward was found in {n_episodes} episodes, so the agent is not adapted: allow more, or train longer.",

@@ -9,12 +9,13 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.adaptation import Step
 from sb3_htr.adaptation.loop import Watched
 from sb3_htr.common.callback import followed_by
-from sb3_htr.common.checks import check_has_env
+from sb3_htr.common.checks import check_has_env, check_is_not_normalized
 from sb3_htr.common.saving import AtomicSave
 from sb3_htr.common.training_state import get_training_state, set_random_state, set_training_state
 
@@ -133,6 +134,14 @@ class Rival(AtomicSave, BaseAlgorithm):
         if explorer not in (None, OwnWay.name):
             raise ValueError(f"{type(self).__name__} has no explorers, but the explorer is {explorer!r}: leave it away.")
         return self._adaptation(n_envs, generator)
+
+    def check_env(self, env: VecEnv) -> None:
+        """
+        :param env: to adapt in
+        :raises ValueError: if its spaces are not those of training, or it normalizes
+        """
+        check_is_not_normalized(env)
+        check_for_correct_spaces(self._wrap_env(env), self.observation_space, self.action_space)
 
     def begin_rollout(self) -> None:
         """Begin new episodes in all envs."""

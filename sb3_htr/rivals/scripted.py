@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.utils import check_for_correct_spaces
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.rivals.base import OwnWay, ToldAdaptation
 
@@ -49,6 +51,13 @@ class ScriptedAgent:
         """
         low, high = self.action_space.low, self.action_space.high
         return np.asarray(low + 0.5 * (actions + 1.0) * (high - low), dtype=np.float32)
+
+    def check_env(self, env: VecEnv) -> None:
+        """
+        :param env: to act in
+        :raises ValueError: if its actions are others than the script's
+        """
+        check_for_correct_spaces(env, env.observation_space, self.action_space)
 
     def start_adaptation(self, n_envs: int, explorer: Any = None, generator: th.Generator | None = None) -> ToldAdaptation:
         """

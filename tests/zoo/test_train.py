@@ -59,6 +59,8 @@ def test_evaluate_prints_a_table_and_draws_pictures(
     assert sum(line.strip().startswith(tuple("123456")) for line in lines) == 6
     run = run_folder(runs)
     record, n = np.load(run / "adaptation.npz"), 20 if "validation" in arguments else 100
+    of = ("last", "validation", "prior") if arguments else ("best", "test", "belief")
+    assert (str(record["set"]), str(record["explorer"])) == of[1:] and ("best" in str(record["model"])) == (of[0] == "best")
     assert record["returns"].shape == (n, 6) and record["achieved"].shape == (n, 6, 20, 2)
     for picture in ("adaptation_curve.png", "adaptation_paths.png"):
         assert (run / picture).read_bytes().startswith(b"\x89PNG")

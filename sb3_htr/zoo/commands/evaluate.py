@@ -51,7 +51,8 @@ def main(argv: Sequence[str]) -> None:
     print(table(record))
     output = args.output or agent.folder or Path(agent.stem)
     with atomic_path(output / "adaptation.npz") as path:
-        np.savez_compressed(path, tasks=tasks, **record._asdict())
+        about = {"model": str(agent.path), "env_id": agent.env_id, "explorer": explorer, "set": args.tasks, "seed": args.seed}
+        np.savez_compressed(path, tasks=tasks, **record._asdict(), **about)
     pictures = [output / "adaptation_curve.png"]
     title = f"{agent.env_id}, {len(tasks)} {args.tasks} tasks, explorer {explorer}"
     plot_adaptation_curve(record, pictures[0], title)

@@ -77,8 +77,8 @@ def main(argv: Sequence[str]) -> None:
         if not {*OF_TRAINING} <= record.keys():
             raise ValueError(f"{run} is no run of sb3-htr train, so there is nothing to go on with: give the folder of one.")
         planned = record["n_timesteps"] + further.n_timesteps
-        if n_steps_done(run) >= planned and (run / f"{file_stem(record['env_id'])}.zip").exists():
-            print(f"{run} is finished, after {planned:,} env steps. To train further: sb3-htr train --resume {run} -n STEPS")
+        if (done := n_steps_done(run)) >= planned and (run / f"{file_stem(record['env_id'])}.zip").exists():
+            print(f"{run} is finished, after {done:,} env steps. To train further: sb3-htr train --resume {run} -n STEPS")
             return
         given = [*given_arguments(record["arguments"]), "--seed", str(record["seed"]), "-n", str(planned)]
         check_arguments(given, record["gym_packages"], run / RECORD, args.trust)
