@@ -156,13 +156,14 @@ def starts_and_tasks(n_moving: int, **settings: Any) -> tuple[np.ndarray, np.nda
 
 def test_tasks_that_the_start_does_not_solve_are_preferred() -> None:
     solved = {}
-    for n_moving in (0, 12):
+    for n_moving in (0, 1, 12):
         for prefer in (False, True):
             starts, tasks = starts_and_tasks(n_moving, prefer_unsolved=prefer)
             solved[n_moving, prefer] = (np.linalg.norm(starts - tasks, axis=1) < FAMILY.goal_radius).mean()
     assert solved[0, False] == solved[0, True] == 1, "where nothing moved, any"
-    # A candidate is unsolved in 1/2 * 5/20 of the cases; of eight, one is with probability .66
-    assert solved[12, False] > 0.6 and solved[12, True] == pytest.approx((1 - 1 / 8) ** 8, abs=0.07)
+    # A candidate is unsolved in 5/20 of the steps of the episodes that move; eight are drawn eight times
+    assert solved[12, False] > 0.6 and solved[12, True] == 0
+    assert solved[1, False] > 0.9 and solved[1, True] == pytest.approx((1 - 1 / 24 * 5 / 20) ** 64, abs=0.07)
 
 
 @pytest.mark.parametrize(

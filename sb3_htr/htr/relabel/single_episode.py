@@ -9,6 +9,8 @@ from sb3_htr.htr.relabel.hindsight_task import HindsightTaskStrategy, solved_at_
 
 # Rows that candidates for hindsight tasks are compared with: enough to tell common from rare, in linear time
 MAX_COMPARED = 64
+# Times that candidates are drawn anew, from episodes of all tasks, where the start solves all of them
+MAX_REDRAWS = 7
 
 
 class SingleEpisodeRelabelling(Relabeller):
@@ -26,7 +28,7 @@ class SingleEpisodeRelabelling(Relabeller):
         episode alone, actor and critics never learn the way to a task from where other tasks lead. By measurement, on a
         two-link arm (one seed): acting with the z of each training task solves .97 of them at 0, all at .25 and .5
     :param prefer_unsolved: of several candidates, a task that was solved already where its episode began is chosen only if all
-        are. An object that nobody touched is where it was, and ``"even"`` does not see it where objects begin elsewhere in
+        are, and as many from episodes of all tasks, drawn seven times. An object that nobody touched is where it was, and ``"even"`` does not see it where objects begin elsewhere in
         each episode. Of one candidate (``"random"``, ``"final"``) there is nothing to prefer
     :raises ValueError: for an unknown strategy or source, or a share out of [0, 1]
     """
@@ -48,20 +50,38 @@ class SingleEpisodeRelabelling(Relabeller):
         self.prefer_unsolved = prefer_unsolved
 
     def draw(self, tasks: np.ndarray) -> HindsightDraw:
-        buffer, strategy = self.buffer, self.hindsight_task_strategy
-        rng, index = buffer.relabel_rng, buffer.episodes.index()
-        first, end = index.task_episode[tasks, None], index.task_episode[tasks + 1, None]
-        episode = first + (rng.random((len(tasks), strategy.n_candidates)) * (end - first)).astype(np.int64)
-        start, end = index.episode_row[episode], index.episode_row[episode + 1]
-        reached = self._steps(start + strategy.steps(end - start, rng))
+        buffer, strategy, index = self.buffer, self.hindsight_task_strategy, self.buffer.episodes.index()
+        episode, step, is_solved = self._candidates(index.task_episode[tasks], index.task_episode[tasks + 1])
+        for _ in range(MAX_REDRAWS):
+            again = np.flatnonzero(is_solved.all(axis=1))
+            if len(again) == 0:
+                break
+            anywhere = np.zeros_like(again), np.full_like(again, len(index.episode_row) - 1)
+            episode[again], step[again], is_solved[again] = self._candidates(*anywhere)
+        reached = self._steps(step)
         hindsight_task = buffer.task_family.hindsight_task(reached, 0)
-        count, is_solved = self._count_alike(reached, hindsight_task), None
-        if self.prefer_unsolved and strategy.n_candidates > 1:
-            is_solved = solved_at_start(buffer.task_family, self._steps(start), hindsight_task)
-        chosen = np.arange(len(tasks)), strategy.choose(count, rng, is_solved)
-        context = np.stack([start[chosen], end[chosen]], axis=1)
-        batch = context if self.rl_batch_source == "episode" else index.all_episodes(tasks)
+        count = self._count_alike(reached, hindsight_task)
+        chosen = np.arange(len(tasks)), strategy.choose(count, buffer.relabel_rng, is_solved)
+        episode = episode[chosen]
+        batch = context = np.stack([index.episode_row[episode], index.episode_row[episode + 1]], axis=1)
+        if self.rl_batch_source == "task":
+            batch = index.all_episodes(np.searchsorted(index.task_episode, episode, side="right") - 1)
         return HindsightDraw(buffer.episodes, context, batch, hindsight_task[chosen], False, self.elsewhere)
+
+    def _candidates(self, first: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """
+        Some episodes of each range (n,), the virtual row of one step of each, and whether the start of the episode solves what
+        this step reached. (n, n_candidates) each.
+        """
+        rng, index, strategy = self.buffer.relabel_rng, self.buffer.episodes.index(), self.hindsight_task_strategy
+        n = len(first), strategy.n_candidates
+        episode = first[:, None] + (rng.random(n) * (end - first)[:, None]).astype(np.int64)
+        start, end = index.episode_row[episode], index.episode_row[episode + 1]
+        step = start + strategy.steps(end - start, rng)
+        if not self.prefer_unsolved or strategy.n_candidates == 1:
+            return episode, step, np.zeros(episode.shape, dtype=bool)
+        family = self.buffer.task_family
+        return episode, step, solved_at_start(family, self._steps(start), family.hindsight_task(self._steps(step), 0))
 
     def _steps(self, virtual: np.ndarray) -> Trajectory:
         """(..., 1, dim), each virtual row as a trajectory of its own."""
