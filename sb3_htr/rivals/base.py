@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import check_for_correct_spaces
@@ -152,11 +153,19 @@ class Rival(AtomicSave, Resumable):
         return super()._setup_learn(*args, **kwargs)
 
 
-def scaled(actions: np.ndarray, env: VecEnv) -> np.ndarray:
+def scaled(actions: np.ndarray, space: spaces.Box) -> np.ndarray:
     """
-    :param actions: (n, action_dim), in the bounds of the action space
-    :param env: has the action space, a Box
-    :return: (n, action_dim) float32, scaled to [-1, 1]
+    :param actions: (..., action_dim), in the bounds of the action space
+    :param space: of actions
+    :return: the same, float32, scaled to [-1, 1]
     """
-    low, high = env.action_space.low, env.action_space.high  # type: ignore[attr-defined]
-    return np.asarray(2.0 * (actions - low) / (high - low) - 1.0, dtype=np.float32)
+    return np.asarray(2.0 * (actions - space.low) / (space.high - space.low) - 1.0, dtype=np.float32)
+
+
+def unscaled(actions: np.ndarray, space: spaces.Box) -> np.ndarray:
+    """
+    :param actions: (..., action_dim), scaled to [-1, 1]
+    :param space: of actions
+    :return: the same, float32, in the bounds of the action space
+    """
+    return np.asarray(space.low + 0.5 * (actions + 1.0) * (space.high - space.low), dtype=np.float32)
