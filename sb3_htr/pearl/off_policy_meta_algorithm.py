@@ -24,6 +24,7 @@ from stable_baselines3.sac import SAC
 from sb3_htr.adaptation.adaptation import Adaptation, Step
 from sb3_htr.adaptation.agent import AdaptedAgent
 from sb3_htr.adaptation.explorers import Explorer, to_explorer
+from sb3_htr.adaptation.explorers.prior import FixedExploration
 from sb3_htr.adaptation.knowledge import LatentKnowledge
 from sb3_htr.adaptation.loop import adaptation_steps
 from sb3_htr.adaptation.task_bank import TaskBank
@@ -153,12 +154,12 @@ class OffPolicyMetaAlgorithm(AtomicSave, Resumable, SAC):
         self._introduce_policy()
 
     def _check_rollouts(self) -> None:
-        n_exploration = getattr(self.train_explorer, "n_exploration_episodes", 0)
-        if 0 < self.n_episodes_per_task <= n_exploration:
+        explorer, n_episodes = self.train_explorer, self.n_episodes_per_task
+        if isinstance(explorer, FixedExploration) and n_episodes <= explorer.n_exploration_episodes:
             warnings.warn(
-                f"A rollout has {self.n_episodes_per_task} episodes on a task, and {self.train_explorer.name!r} explores for "
-                f"{n_exploration}: none will act by what was inferred. Raise n_episodes_per_task, or give train_explorer="
-                f"{{'name': {self.train_explorer.name!r}, 'n_exploration_episodes': {self.n_episodes_per_task // 2}}}."
+                f"A rollout has {n_episodes} episodes on a task, and {explorer.name!r} explores for "
+                f"{explorer.n_exploration_episodes}: none will act by what was inferred. Raise n_episodes_per_task, or give "
+                f"train_explorer={{'name': {explorer.name!r}, 'n_exploration_episodes': {n_episodes // 2}}}."
             )
 
     def _setup_replay(self, env: VecEnv) -> None:
