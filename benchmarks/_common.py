@@ -1,6 +1,7 @@
 """What the benchmarks share: timing two things side by side, models of the paper's sizes, and the files that they write."""
 
 import json
+import os
 import platform
 import statistics
 import sys
@@ -18,7 +19,7 @@ import htr_envs  # noqa: F401 registers the envs
 from sb3_htr import PEARL
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.vec_env import make_task_vec_env
-from sb3_htr.common.versions import commit, named
+from sb3_htr.common.versions import commit, named, processor
 from sb3_htr.zoo.run.memory import keep_freed_memory
 
 # As sb3-htr train does
@@ -145,8 +146,5 @@ def machine() -> str:
     """
     :return: processor, threads and versions
     """
-    cpuinfo = Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    processor = f"{names[0]}, {len(names)} cores" if names else platform.machine()
-    return f"{processor}, Python {platform.python_version()}, torch {th.__version__}, {th.get_num_threads()} thread(s)"
+    about = f"{processor()}, {os.cpu_count()} cores, Python {platform.python_version()}, torch {th.__version__}"
+    return f"{about}, {th.get_num_threads()} thread(s)"

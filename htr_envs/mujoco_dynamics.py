@@ -153,11 +153,6 @@ class MujocoDynamics(Dynamics[PositionGoalFamily]):
                 opened[0].close()
         self._rollout = self._renderer = None
 
-    @property
-    def control_step(self) -> float:
-        """Duration of a control step in seconds."""
-        return float(self.frame_skip * self.model.opt.timestep)
-
     def positions(self, states: DoubleArray) -> DoubleArray:
         """Generalised positions (n, nq) in states (n, state_dim), a view."""
         return states[:, 1 : 1 + self.model.nq]

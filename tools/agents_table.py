@@ -9,10 +9,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from tables import fill
 
 from sb3_htr.adaptation.evaluation import record_adaptation
+from sb3_htr.adaptation.first_success import first_success
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.zoo.run.agents import agent_at
 from sb3_htr.zoo.run.method import methods
@@ -56,8 +56,11 @@ def measure(path: Path, known: dict[str, list[float]]) -> dict[str, list[float]]
             continue
         print(f"Adapting {path.name} of {path.parent.name} by {explorer}")
         returns, successes, _ = record_adaptation(model, agent.make_vec_env(100), None, N_EPISODES, explorer)
-        first = np.where(successes.any(axis=1), successes.argmax(axis=1) + 1, N_EPISODES + 1)
-        scores[explorer] = [float(returns[:, -1].mean()), float(successes[:, -1].mean()), float(first.mean())]
+        scores[explorer] = [
+            float(returns[:, -1].mean()),
+            float(successes[:, -1].mean()),
+            float(first_success(successes).mean()),
+        ]
     return scores
 
 

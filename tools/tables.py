@@ -19,8 +19,6 @@ COLUMNS = {
     "success_rate": "tasks solved in it",
     "episodes_to_first_success": "episodes to the first success",
 }
-# Experiments whose families tell no successes
-DENSE = ("half_cheetah_velocity",)
 
 
 def columns(summary: dict[str, Any]) -> dict[str, str]:
@@ -29,7 +27,9 @@ def columns(summary: dict[str, Any]) -> dict[str, str]:
     :return: metrics and heads of the columns of scores
     """
     n_episodes = summary["rows"][0].get("n_episodes", 20)
-    shown = ("last_episode_return",) if summary["name"] in DENSE else (*COLUMNS,)
+    # A family that tells no successes has none
+    has_successes = any(row["metric"] == "success_rate" and row["high"] > 0 for row in summary["rows"])
+    shown = COLUMNS if has_successes else ("last_episode_return",)
     return {metric: COLUMNS[metric].format(n_episodes=n_episodes) for metric in shown}
 
 

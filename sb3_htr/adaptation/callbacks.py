@@ -11,6 +11,7 @@ from stable_baselines3.common.callbacks import EvalCallback
 
 from sb3_htr.adaptation.evaluation import MetaLearner, record_adaptation
 from sb3_htr.adaptation.explorers import to_explorer
+from sb3_htr.adaptation.first_success import first_success
 from sb3_htr.common.atomic import WRITE_ERRORS, atomic_path, reason
 from sb3_htr.common.checks import get_task_family
 
@@ -130,13 +131,10 @@ class MetaEvalCallback(EvalCallback):
             )
 
     def _log(self, returns: np.ndarray, successes: np.ndarray) -> None:
-        found = successes.any(axis=1)
-        # A task that was never solved counts as if it were solved just after the end
-        first = np.where(found, successes.argmax(axis=1) + 1, successes.shape[1] + 1)
         self.logger.record("eval/mean_reward", self.last_mean_reward)
         self.logger.record("eval/first_episode_return", float(returns[:, 0].mean()))
         self.logger.record("eval/success_rate", float(successes[:, -1].mean()))
-        self.logger.record("eval/episodes_to_first_success", float(first.mean()))
+        self.logger.record("eval/episodes_to_first_success", float(first_success(successes).mean()))
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
         if self.verbose >= 1:

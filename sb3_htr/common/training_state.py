@@ -1,66 +1,80 @@
 """What a training in progress is between two rollouts, of any Stable-Baselines3 algorithm, as plain data."""
 
 from collections import deque
-from collections.abc import Iterable
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_htr.common.random_state import get_generator_state, get_global_state, set_generator_state, set_global_state
 
 
-def get_training_state(model: BaseAlgorithm, counters: Iterable[str]) -> dict[str, Any]:
+class Resumable(BaseAlgorithm):
     """
-    :param model: between two rollouts
-    :param counters: names of its attributes that are numbers and go on
-    :return: tensors, numbers, strings, None: networks and optimizers, counters, statistics of episodes, random generators.
-        Not the states of the envs, of which a rollout that begins with a reset has no need
+    A mixin for algorithms of Stable-Baselines3 whose training goes on exactly where it was. A rollout must begin with a reset
+    of all envs, so that of their states only the random generators are needed.
     """
-    assert model.env is not None
-    log_ent_coef = getattr(model, "log_ent_coef", None)
-    return {
-        "parameters": model.get_parameters(),
-        "log_ent_coef": None if log_ent_coef is None else log_ent_coef.detach(),
-        "counters": {name: getattr(model, name) for name in counters},
-        "episode_infos": [{k: _tensor(v) for k, v in info.items()} for info in model.ep_info_buffer or ()],
-        "episode_successes": [_tensor(success) for success in model.ep_success_buffer or ()],
-        "random": {
-            "global": get_global_state(),
-            "envs": [get_generator_state(generator) for generator in model.env.get_attr("np_random")],
-        },
-    }
 
+    #: Names of attributes that are numbers and go on
+    COUNTERS: ClassVar[tuple[str, ...]] = ("num_timesteps", "_episode_num", "_n_updates", "_current_progress_remaining")
+    #: Takes effect once learn() has set everything up, which draws random numbers
+    _pending_random: dict[str, Any] | None = None
 
-def set_training_state(model: BaseAlgorithm, state: dict[str, Any]) -> None:
-    """
-    All but the random generators, which follow by :func:`set_random_state` once everything is set up.
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: everything that a training in progress is, between two rollouts, as tensors, numbers, strings and None; for
+            :meth:`load_state_dict`
+        """
+        log_ent_coef = getattr(self, "log_ent_coef", None)
+        return {
+            "parameters": self.get_parameters(),
+            "log_ent_coef": None if log_ent_coef is None else log_ent_coef.detach(),
+            "counters": {name: getattr(self, name) for name in self.COUNTERS},
+            "episode_infos": [{k: _tensor(v) for k, v in info.items()} for info in self.ep_info_buffer or ()],
+            "episode_successes": [_tensor(success) for success in self.ep_success_buffer or ()],
+            "random": self._get_random_state(),
+        }
 
-    :param model: that was just made, with the same settings
-    :param state: of :func:`get_training_state`
-    """
-    model.set_parameters(state["parameters"], exact_match=True, device=model.device)
-    if getattr(model, "log_ent_coef", None) is not None:
-        model.log_ent_coef.data.copy_(state["log_ent_coef"])  # type: ignore[attr-defined]
-    for name, value in state["counters"].items():
-        setattr(model, name, value)
-    infos = [{key: _number(value) for key, value in info.items()} for info in state["episode_infos"]]
-    model.ep_info_buffer = deque(infos, maxlen=model._stats_window_size)
-    successes = [_number(success) for success in state["episode_successes"]]
-    model.ep_success_buffer = deque(successes, maxlen=model._stats_window_size)
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        The random generators follow when ``learn(remaining steps, reset_num_timesteps=False)`` begins.
 
+        :param state: of :meth:`state_dict` of a model with the same settings
+        """
+        self.set_parameters(state["parameters"], exact_match=True, device=self.device)
+        if getattr(self, "log_ent_coef", None) is not None:
+            self.log_ent_coef.data.copy_(state["log_ent_coef"])  # type: ignore[attr-defined]
+        for name, value in state["counters"].items():
+            setattr(self, name, value)
+        infos = [{key: _number(value) for key, value in info.items()} for info in state["episode_infos"]]
+        self.ep_info_buffer = deque(infos, maxlen=self._stats_window_size)
+        successes = [_number(success) for success in state["episode_successes"]]
+        self.ep_success_buffer = deque(successes, maxlen=self._stats_window_size)
+        self._pending_random = state["random"]
 
-def set_random_state(env: VecEnv, state: dict[str, Any]) -> None:
-    """
-    :param env: of the training
-    :param state: ``"random"`` of :func:`get_training_state`
-    """
-    set_global_state(state["global"])
-    for i, (generator, saved) in enumerate(zip(env.get_attr("np_random"), state["envs"], strict=True)):
-        set_generator_state(generator, saved)
-        env.set_attr("np_random", generator, indices=i)
+    def _get_random_state(self) -> dict[str, Any]:
+        assert self.env is not None
+        envs = [get_generator_state(generator) for generator in self.env.get_attr("np_random")]
+        return {"global": get_global_state(), "envs": envs}
+
+    def _set_random_state(self, state: dict[str, Any]) -> None:
+        assert self.env is not None
+        set_global_state(state["global"])
+        for i, (generator, saved) in enumerate(zip(self.env.get_attr("np_random"), state["envs"], strict=True)):
+            set_generator_state(generator, saved)
+            self.env.set_attr("np_random", generator, indices=i)
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        result = super()._setup_learn(*args, **kwargs)
+        if self._pending_random is not None:
+            self._set_random_state(self._pending_random)
+            self._pending_random = None
+        return result
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_pending_random"]
 
 
 def _tensor(value: Any) -> th.Tensor:

@@ -23,6 +23,16 @@ def versions() -> dict[str, str]:
     return result
 
 
+def processor() -> str:
+    """
+    :return: name of the processor, as far as the system tells
+    """
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
 def commit(*paths: str) -> dict[str, str | bool]:
     """
     :param paths: git's, of what counts as changed; all by default

@@ -14,13 +14,12 @@ from sb3_htr.adaptation.knowledge import Particles
 class TrainingTasksAlone(Belief):
     """No particles of hindsight tasks."""
 
-    def start(self) -> None:
-        super().start()
-        z, gain, returns, log_prior, kept = self.particles
-        if kept.any():
-            self.particles = Particles(z[kept], gain[kept][:, kept], returns[kept][:, kept], log_prior[kept], kept[kept])
-            self._tasks, self.log_weights = self._tasks[kept], self.log_weights[:, kept]
-            self._tried = self._tried[:, kept.cpu().numpy()]
+    def known_tasks(self) -> Particles:
+        tasks = super().known_tasks()
+        z, gain, returns, log_prior, kept = tasks
+        if not kept.any():
+            return tasks
+        return Particles(z[kept], gain[kept][:, kept], returns[kept][:, kept], log_prior[kept], kept[kept])
 
 
 @dataclass
@@ -36,22 +35,16 @@ class UniformPrior(Belief):
 class NoPosterior(Belief):
     """The encoder's posterior mean is never acted with."""
 
-    def _end(self, envs: np.ndarray) -> None:
-        super()._end(envs)
-        self._has_proposal[envs] = False
+    def propose(self, envs: np.ndarray) -> None:
+        pass
 
 
 @dataclass
 class NoValue(Belief):
     """Before the first reward, what an episode is expected to earn alone: not how soon, nor whether the policy gets there."""
 
-    def _search(self, envs: np.ndarray, obs: np.ndarray) -> None:
-        if len(envs):
-            with th.no_grad():
-                best = (self.weights(envs) @ self.particles.gain.T).argmax(dim=1)
-            chosen = self.particles.z[best].cpu().numpy()
-            self._turned[envs] |= ~self._at_start[envs] & (chosen != self.z[envs]).any(axis=1)
-            self.z[envs] = chosen
+    def most_promising(self, envs: np.ndarray, obs: np.ndarray) -> th.Tensor:
+        return self.particles.z[(self.weights(envs) @ self.particles.gain.T).argmax(dim=1)]
 
 
 @dataclass

@@ -6,7 +6,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
-from htr_envs import PointRobotFamily
+from htr_envs.point_robot import STEP_SIZE, PointRobotFamily
 from sb3_htr.experiments.calibration import expected_calibration_error
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.protocol import scores
@@ -104,13 +104,14 @@ def optimal_return(goal_distance: float, max_episode_steps: int) -> float:
     :param max_episode_steps: argument of the env
     :return: mean return over the test tasks of going to the goal as fast as possible and staying there
     """
-    goals = PointRobotFamily(goal_distance=goal_distance).test_tasks.astype(np.float64)
+    family = PointRobotFamily(goal_distance=goal_distance)
+    goals = family.test_tasks.astype(np.float64)
     position, total = np.zeros_like(goals), np.zeros(len(goals))
     for _ in range(max_episode_steps):
         # Each axis is clipped on its own, so this is at least as fast as the straight way
-        position += np.clip(goals - position, -0.1, 0.1)
+        position += np.clip(goals - position, -STEP_SIZE, STEP_SIZE)
         distance = np.linalg.norm(goals - position, axis=1)
-        total += np.where(distance < 0.2, 1 - distance, 0)
+        total += np.where(distance < family.goal_radius, 1 - distance, 0)
     return float(total.mean())
 
 

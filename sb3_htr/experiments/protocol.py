@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from sb3_htr.adaptation.evaluation import evaluate_adaptation
+from sb3_htr.adaptation.first_success import first_success
 from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.experiments.ablations import ABLATIONS
@@ -56,8 +57,7 @@ def success_rate(raw: Raw, evaluation: str) -> np.ndarray:
 
 def episodes_to_first_success(raw: Raw, evaluation: str) -> np.ndarray:
     """(n_eval_seeds, n_tasks), the first episode that solved the task; one more than there are if none did."""
-    successes = raw[f"successes_{evaluation}"]
-    return np.where(successes.any(axis=-1), successes.argmax(axis=-1) + 1, successes.shape[-1] + 1)
+    return first_success(raw[f"successes_{evaluation}"])
 
 
 def loss_of_stability(raw: Raw, evaluation: str) -> np.ndarray:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.versions import processor
 from sb3_htr.experiments import figures
 from sb3_htr.experiments.calibration import expected_calibration_error
 from sb3_htr.experiments.cell import Cell, Evaluation
@@ -78,7 +79,7 @@ def summarize(command: str, results: dict[Cell, Path]) -> dict[str, Any]:
         "command": command,
         **{key: ", ".join(sorted({str(raw[key]) for runs in all_runs for raw in runs.raws})) for key in COMMITS},
         "date": date.today().isoformat(),
-        "machine": f"{_processor()}, one thread per run, Python {platform.python_version()}",
+        "machine": f"{processor()}, one thread per run, Python {platform.python_version()}",
         "n_eval_seeds": len(EVAL_SEEDS),
         "rows": [row for runs in all_runs for row in _rows(runs)],
         "differences": [row for first, *others in compared for other in others for row in _differences(first, other)],
@@ -124,13 +125,6 @@ def _explorer_differences(runs: Runs) -> Iterator[dict[str, Any]]:
 def _rounded(interval: tuple[float, float, float]) -> dict[str, float]:
     # adding 0 turns -0 into 0
     return {key: round(value, 3) + 0.0 for key, value in zip(("iqm", "low", "high"), interval, strict=True)}
-
-
-def _processor() -> str:
-    for line in Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []:
-        if line.startswith("model name"):
-            return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
 
 
 def check(results: dict[Cell, Path]) -> None:

@@ -24,6 +24,7 @@ from stable_baselines3.sac import SAC
 from sb3_htr.adaptation.adaptation import Adaptation, Step
 from sb3_htr.adaptation.agent import AdaptedAgent
 from sb3_htr.adaptation.explorers import Explorer, to_explorer
+from sb3_htr.adaptation.explorers.prior import FixedExploration
 from sb3_htr.adaptation.knowledge import LatentKnowledge
 from sb3_htr.adaptation.loop import adaptation_steps
 from sb3_htr.adaptation.task_bank import TaskBank
@@ -34,7 +35,7 @@ from sb3_htr.common.latent_policy import Obs, State
 from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.random_state import get_generator_state, set_generator_state
 from sb3_htr.common.saving import AtomicSave, with_suffix
-from sb3_htr.common.training_state import get_training_state, set_random_state, set_training_state
+from sb3_htr.common.training_state import Resumable
 from sb3_htr.common.vec_env import in_float32, make_task_vec_env
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.pearl.horizon import complete, timesteps_for
@@ -42,10 +43,8 @@ from sb3_htr.pearl.policies import PEARLPolicy
 
 SelfMetaAlgorithm = TypeVar("SelfMetaAlgorithm", bound="OffPolicyMetaAlgorithm")
 
-COUNTERS = ("num_timesteps", "_episode_num", "_n_updates", "_n_rollouts", "_current_progress_remaining")
 
-
-class OffPolicyMetaAlgorithm(AtomicSave, SAC):
+class OffPolicyMetaAlgorithm(AtomicSave, Resumable, SAC):
     """
     SAC whose rollouts are adaptations to training tasks and whose replay is ordered by task. A subclass adds ``train``.
 
@@ -67,6 +66,7 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
     :param kwargs: arguments of SAC
     """
 
+    COUNTERS = (*Resumable.COUNTERS, "_n_rollouts")
     policy: PEARLPolicy
     replay_buffer: MultiTaskReplayBuffer | None
 
@@ -137,8 +137,6 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
         self._task_queue = np.zeros(0, dtype=np.int64)
         self._n_rollouts = 0
         self._warned_not_adapted = False
-        # Of a training that goes on: takes effect once learn() has set everything up, which draws random numbers
-        self._pending_random: dict[str, Any] | None = None
 
     def _setup_model(self) -> None:
         # Given to load() in place of those of the file, they are what a user writes
@@ -156,12 +154,12 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
         self._introduce_policy()
 
     def _check_rollouts(self) -> None:
-        n_exploration = getattr(self.train_explorer, "n_exploration_episodes", 0)
-        if 0 < self.n_episodes_per_task <= n_exploration:
+        explorer, n_episodes = self.train_explorer, self.n_episodes_per_task
+        if isinstance(explorer, FixedExploration) and n_episodes <= explorer.n_exploration_episodes:
             warnings.warn(
-                f"A rollout has {self.n_episodes_per_task} episodes on a task, and {self.train_explorer.name!r} explores for "
-                f"{n_exploration}: none will act by what was inferred. Raise n_episodes_per_task, or give train_explorer="
-                f"{{'name': {self.train_explorer.name!r}, 'n_exploration_episodes': {self.n_episodes_per_task // 2}}}."
+                f"A rollout has {n_episodes} episodes on a task, and {explorer.name!r} explores for "
+                f"{explorer.n_exploration_episodes}: none will act by what was inferred. Raise n_episodes_per_task, or give "
+                f"train_explorer={{'name': {explorer.name!r}, 'n_exploration_episodes': {n_episodes // 2}}}."
             )
 
     def _setup_replay(self, env: VecEnv) -> None:
@@ -276,13 +274,7 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
                 "load_replay_buffer brings back what save_replay_buffer has saved.",
                 stacklevel=3,
             )
-        result = super()._setup_learn(*args, **kwargs)
-        if self._pending_random is not None:
-            assert self.env is not None
-            set_random_state(self.env, self._pending_random)
-            set_generator_state(self._rng, self._pending_random["model"])
-            self._pending_random = None
-        return result
+        return super()._setup_learn(*args, **kwargs)
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         # The last rollout may go beyond the budget, and a schedule must not go below its end
@@ -504,7 +496,7 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
     # Files and state
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "knowledge", "task_bank", "_pending_random", "update_listeners"]
+        return [*super()._excluded_save_params(), "knowledge", "task_bank", "update_listeners"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()
@@ -561,29 +553,19 @@ class OffPolicyMetaAlgorithm(AtomicSave, SAC):
         return {"replay": replay.state_dict(), "task_bank": task_bank.state_dict()}
 
     def state_dict(self) -> dict[str, Any]:
-        """
-        Everything that a meta-training in progress is, between two rollouts: a rollout begins with a reset of all envs, so
-        their states are not needed, only those of their random generators.
-
-        :return: tensors, numbers, strings, None, for :meth:`load_state_dict`
-        """
-        replay_state, state = self._replay_state(), get_training_state(self, COUNTERS)
-        return {
-            **state,
-            **replay_state,
-            "task_queue": th.from_numpy(self._task_queue.copy()),
-            "random": {**state["random"], "model": get_generator_state(self._rng)},
-        }
+        replay = self._replay_state()
+        return {**super().state_dict(), **replay, "task_queue": th.from_numpy(self._task_queue.copy())}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """
-        The random generators follow when ``learn(remaining steps, reset_num_timesteps=False)`` begins.
-
-        :param state: of :meth:`state_dict` of a model with the same settings
-        """
         replay, task_bank = self._replay()
-        set_training_state(self, state)
+        super().load_state_dict(state)
         self._task_queue = state["task_queue"].numpy().copy()
         replay.load_state_dict(state["replay"])
         task_bank.load_state_dict(state["task_bank"])
-        self._pending_random = state["random"]
+
+    def _get_random_state(self) -> dict[str, Any]:
+        return {**super()._get_random_state(), "model": get_generator_state(self._rng)}
+
+    def _set_random_state(self, state: dict[str, Any]) -> None:
+        super()._set_random_state(state)
+        set_generator_state(self._rng, state["model"])

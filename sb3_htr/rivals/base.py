@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.base_class import BaseAlgorithm
+from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import check_for_correct_spaces
@@ -17,9 +17,7 @@ from sb3_htr.adaptation.loop import Watched
 from sb3_htr.common.callback import followed_by
 from sb3_htr.common.checks import check_has_env, check_is_not_normalized
 from sb3_htr.common.saving import AtomicSave
-from sb3_htr.common.training_state import get_training_state, set_random_state, set_training_state
-
-COUNTERS = ("num_timesteps", "_episode_num", "_n_updates", "_current_progress_remaining")
+from sb3_htr.common.training_state import Resumable
 
 
 class OwnWay:
@@ -101,7 +99,7 @@ class FreshStart(BaseCallback):
         return True
 
 
-class Rival(AtomicSave, BaseAlgorithm):
+class Rival(AtomicSave, Resumable):
     """
     A mixin for algorithms of Stable-Baselines3. It is made as :class:`sb3_htr.PEARL` is: of a policy and an env of a task
     family. What the algorithm needs around the env is put there by its ``_wrap_env``.
@@ -116,8 +114,6 @@ class Rival(AtomicSave, BaseAlgorithm):
     ACTS_BY: ClassVar[tuple[str, ...]] = ()
     ACTS_WITH: ClassVar[dict[str, Any]] = {}
     explorer = OwnWay()
-    #: Of a training that goes on: takes effect once learn() has set everything up, which draws random numbers
-    _pending_random: dict[str, Any] | None = None
 
     @abstractmethod
     def _adaptation(self, n_envs: int, generator: th.Generator | None) -> Watched:
@@ -154,37 +150,22 @@ class Rival(AtomicSave, BaseAlgorithm):
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         check_has_env(self.env)
-        assert self.env is not None
-        result = super()._setup_learn(*args, **kwargs)
-        if self._pending_random is not None:
-            set_random_state(self.env, self._pending_random)
-            self._pending_random = None
-        return result
-
-    def state_dict(self) -> dict[str, Any]:
-        """
-        :return: everything that a training in progress is, between two rollouts, for :meth:`load_state_dict`
-        """
-        return get_training_state(self, COUNTERS)
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """
-        The random generators follow when ``learn(remaining steps, reset_num_timesteps=False)`` begins.
-
-        :param state: of :meth:`state_dict` of a model with the same settings
-        """
-        set_training_state(self, state)
-        self._pending_random = state["random"]
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_pending_random"]
+        return super()._setup_learn(*args, **kwargs)
 
 
-def scaled(actions: np.ndarray, env: VecEnv) -> np.ndarray:
+def scaled(actions: np.ndarray, space: spaces.Box) -> np.ndarray:
     """
-    :param actions: (n, action_dim), in the bounds of the action space
-    :param env: has the action space, a Box
-    :return: (n, action_dim) float32, scaled to [-1, 1]
+    :param actions: (..., action_dim), in the bounds of the action space
+    :param space: of actions
+    :return: the same, float32, scaled to [-1, 1]
     """
-    low, high = env.action_space.low, env.action_space.high  # type: ignore[attr-defined]
-    return np.asarray(2.0 * (actions - low) / (high - low) - 1.0, dtype=np.float32)
+    return np.asarray(2.0 * (actions - space.low) / (space.high - space.low) - 1.0, dtype=np.float32)
+
+
+def unscaled(actions: np.ndarray, space: spaces.Box) -> np.ndarray:
+    """
+    :param actions: (..., action_dim), scaled to [-1, 1]
+    :param space: of actions
+    :return: the same, float32, in the bounds of the action space
+    """
+    return np.asarray(space.low + 0.5 * (actions + 1.0) * (space.high - space.low), dtype=np.float32)

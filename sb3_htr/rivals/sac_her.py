@@ -25,7 +25,7 @@ from sb3_htr.common.checks import (
 )
 from sb3_htr.common.type_aliases import Trajectory
 from sb3_htr.common.vec_env import in_float32, make_task_vec_env
-from sb3_htr.rivals.base import Rival, ToldAdaptation
+from sb3_htr.rivals.base import Rival, ToldAdaptation, unscaled
 from sb3_htr.rivals.shown_task import ShownTaskVecEnv
 
 # Of an env that is given by its id
@@ -41,10 +41,10 @@ class TaskHerReplayBuffer(HerReplayBuffer):
         self, batch_indices: np.ndarray, env_indices: np.ndarray, env: VecNormalize | None = None
     ) -> DictReplayBufferSamples:
         assert isinstance(self.env, ShownTaskVecEnv) and isinstance(self.action_space, spaces.Box)
-        at, space = (batch_indices, env_indices), self.action_space
+        at = batch_indices, env_indices
         own, goals = self.next_observations["desired_goal"][at], self._sample_goals(batch_indices, env_indices)
         obs, next_obs = self.observations["observation"][at], self.next_observations["observation"][at]
-        actions = space.low + 0.5 * (self.actions[at] + 1.0) * (space.high - space.low)
+        actions = unscaled(self.actions[at], self.action_space)
         step = Trajectory(*(x[:, None] for x in (obs, actions, next_obs, np.zeros(len(obs), dtype=np.float32))))
         # What a step earned beside its own task stays
         family = self.env.shown.family

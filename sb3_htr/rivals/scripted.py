@@ -9,7 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_htr.rivals.base import OwnWay, ToldAdaptation
+from sb3_htr.rivals.base import OwnWay, ToldAdaptation, unscaled
 
 # Observations (n, obs_dim) and tasks (n, task_dim) to actions (n, action_dim), scaled to [-1, 1]
 Script = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -49,8 +49,7 @@ class ScriptedAgent:
         :param actions: (n, action_dim), scaled to [-1, 1]
         :return: the same, in the bounds of the action space
         """
-        low, high = self.action_space.low, self.action_space.high
-        return np.asarray(low + 0.5 * (actions + 1.0) * (high - low), dtype=np.float32)
+        return unscaled(actions, self.action_space)
 
     def check_env(self, env: VecEnv) -> None:
         """

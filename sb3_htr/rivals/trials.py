@@ -100,7 +100,8 @@ class TrialVecEnv(VecEnvWrapper):
     def step_wait(self) -> VecEnvStepReturn:
         obs, rewards, dones, infos = self.venv.step_wait()
         assert isinstance(obs, np.ndarray)
-        self._last.take_in(scaled(self._actions, self.venv), rewards, dones)
+        assert isinstance(self.action_space, spaces.Box)
+        self._last.take_in(scaled(self._actions, self.action_space), rewards, dones)
         ended = np.flatnonzero(dones)
         trial_ends = np.zeros(self.num_envs, dtype=bool)
         if len(ended):

@@ -103,7 +103,7 @@ def test_steps_are_mujocos_own(env_id: str) -> None:
         if env_id == ANT:
             cost += 5e-4 * np.square(np.clip(data.sensordata, -1.0, 1.0)).sum() - 0.05
         assert info["task_free_reward"] == pytest.approx(-cost, abs=1e-6)
-    assert data.time == pytest.approx(100 * dynamics.control_step)
+    assert data.time == pytest.approx(100 * dynamics.frame_skip * model.opt.timestep)
 
 
 # ---------------------------------------------------------------- copies, threads, randomness

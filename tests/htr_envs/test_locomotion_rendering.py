@@ -96,6 +96,6 @@ def test_a_window_shows_the_reset_and_each_step(env_id: str, monkeypatch: pytest
     env.reset(seed=0, options={"task": [0.5, 1.0]})
     env.step(env.action_space.sample())
     env.close()
-    step = robots(base).control_step
+    step = robots(base).frame_skip * robots(base).model.opt.timestep
     assert shown == [("human", [0.5, 1.0], 0.0), ("human", [0.5, 1.0], pytest.approx(step)), "closed"]
     assert env.metadata["render_fps"] == pytest.approx(1.0 / step)

@@ -83,18 +83,25 @@ class Belief(ParticleExplorer):
         self._at_start[:] = False
 
     def _search(self, envs: np.ndarray, obs: np.ndarray) -> None:
-        """What earns most, and soonest."""
         if len(envs) == 0:
             return
-        n_compared = min(N_COMPARED, len(self.particles.z))
         with th.no_grad():
-            gain, index = (self.weights(envs) @ self.particles.gain.T).topk(n_compared, dim=1)
-            z = self.particles.z[index]
-            beside = self.adaptation.policy.values(obs[envs], z) - self.adaptation.knowledge.task_free_value
-            promise = gain * beside.clamp(min=MIN_VALUE)
-        chosen = z[th.arange(len(envs)), promise.argmax(dim=1)].cpu().numpy()
+            chosen = self.most_promising(envs, obs).cpu().numpy()
         self._turned[envs] |= ~self._at_start[envs] & (chosen != self.z[envs]).any(axis=1)
         self.z[envs] = chosen
+
+    def most_promising(self, envs: np.ndarray, obs: np.ndarray) -> th.Tensor:
+        """
+        :param envs: (k,) int, where the task is searched for
+        :param obs: (n_envs, obs_dim), what is acted on
+        :return: (k, latent_dim), z of the particles that earn most, and soonest
+        """
+        n_compared = min(N_COMPARED, len(self.particles.z))
+        gain, index = (self.weights(envs) @ self.particles.gain.T).topk(n_compared, dim=1)
+        z = self.particles.z[index]
+        beside = self.adaptation.policy.values(obs[envs], z) - self.adaptation.knowledge.task_free_value
+        promise = gain * beside.clamp(min=MIN_VALUE)
+        return z[th.arange(len(envs)), promise.argmax(dim=1)]
 
     def _exploit(self, envs: np.ndarray) -> None:
         """What returns most."""
@@ -127,8 +134,16 @@ class Belief(ParticleExplorer):
         self._best_return[envs] = np.maximum(self._best_return[envs], returns)
         repeatable = envs[~self._turned[envs] & (returns > self._best_z_return[envs] + ROUNDING)]
         self._best_z[repeatable], self._best_z_return[repeatable] = self.z[repeatable], episode_return[repeatable]
-        self.adaptation.infer(better, keep=False)
-        self._proposal[better] = self.adaptation.posterior(better)[0]
-        self._has_proposal[better] = True
+        self.propose(better)
         self._turned[envs], self._at_start[envs] = False, True
         self._n_steps[envs], self._particle[envs] = 0, -1
+
+    def propose(self, envs: np.ndarray) -> None:
+        """
+        Let the encoder have its word, which is tried once.
+
+        :param envs: (k,) int, whose episodes that end are the best so far
+        """
+        self.adaptation.infer(envs, keep=False)
+        self._proposal[envs] = self.adaptation.posterior(envs)[0]
+        self._has_proposal[envs] = True

@@ -7,14 +7,14 @@ import numpy as np
 import torch as th
 
 from sb3_htr.adaptation.explorers.particles import ParticleExplorer
-from sb3_htr.common.checks import check_numbers
+from sb3_htr.adaptation.explorers.prior import FixedExploration
 
 if TYPE_CHECKING:
     from sb3_htr.adaptation.adaptation import Step
 
 
 @dataclass
-class LearnedPrior(ParticleExplorer):
+class LearnedPrior(FixedExploration, ParticleExplorer):
     """
     Posterior sampling, as PEARL has it, with an empirical prior in place of N(0, I): the posterior means of solved training
     tasks. z is drawn from it for a fixed number of episodes, and then from the posterior over all episodes, their misses
@@ -23,12 +23,9 @@ class LearnedPrior(ParticleExplorer):
     :param n_exploration_episodes: episodes before the posterior is used (PEARL's reference, num_exp_traj_eval: 5)
     """
 
-    n_exploration_episodes: int = 5
-
     def __post_init__(self) -> None:
         super().__post_init__()
         self.name = "learned-prior"
-        check_numbers(n_exploration_episodes=(self.n_exploration_episodes, 0, float("inf")))
 
     def start(self) -> None:
         super().start()
@@ -42,9 +39,6 @@ class LearnedPrior(ParticleExplorer):
         ended = np.flatnonzero(step.dones)
         if len(ended):
             self._draw(ended)
-
-    def exploring(self) -> np.ndarray:
-        return np.asarray(self.adaptation.n_episodes < self.n_exploration_episodes)
 
     def _draw(self, envs: np.ndarray) -> None:
         exploring = th.as_tensor(self.exploring()[envs], device=self._prior.device)[:, None]

@@ -49,7 +49,7 @@ class ParticleExplorer(Explorer):
 
     def start(self) -> None:
         adaptation = self.adaptation
-        self.particles = adaptation.knowledge.particles()
+        self.particles = self.known_tasks()
         if len(self.particles.z) == 0:
             z = th.as_tensor(adaptation.noise(N_DRAWS), device=adaptation.policy.device)
             eye, flat = th.eye(N_DRAWS, device=z.device), th.zeros(N_DRAWS, device=z.device)
@@ -58,6 +58,12 @@ class ParticleExplorer(Explorer):
             self._tasks = adaptation.policy.reward_model.task_tower(self.particles.z)
         self.log_weights = self.particles.log_prior.repeat(adaptation.n_envs, 1)
         self.z = np.zeros((adaptation.n_envs, adaptation.policy.latent_dim), dtype=np.float32)
+
+    def known_tasks(self) -> Particles:
+        """
+        :return: the tasks that the belief is about; none before meta-training has solved one
+        """
+        return self.adaptation.knowledge.particles()
 
     def weights(self, envs: np.ndarray) -> th.Tensor:
         """

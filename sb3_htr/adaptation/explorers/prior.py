@@ -13,9 +13,9 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class Prior(Explorer):
+class FixedExploration(Explorer):
     """
-    z ~ N(0, I) for a fixed number of episodes, then from the posterior over all episodes.
+    Explores for a number of episodes that is fixed beforehand, whatever they find.
 
     :param n_exploration_episodes: episodes before the posterior is used (PEARL's reference, num_exp_traj_eval: 5)
     """
@@ -26,6 +26,18 @@ class Prior(Explorer):
         super().__post_init__()
         check_numbers(n_exploration_episodes=(self.n_exploration_episodes, 0, float("inf")))
 
+    def exploring(self) -> np.ndarray:
+        return np.asarray(self.adaptation.n_episodes < self.n_exploration_episodes)
+
+
+@dataclass
+class Prior(FixedExploration):
+    """
+    z ~ N(0, I) for a fixed number of episodes, then from the posterior over all episodes.
+
+    :param n_exploration_episodes: episodes before the posterior is used (PEARL's reference, num_exp_traj_eval: 5)
+    """
+
     def start(self) -> None:
         self.z = np.zeros((self.adaptation.n_envs, self.adaptation.policy.latent_dim), dtype=np.float32)
         self._draw(np.arange(len(self.z)))
@@ -35,9 +47,6 @@ class Prior(Explorer):
         if len(ended):
             self.adaptation.infer(ended, keep=True)
             self._draw(ended)
-
-    def exploring(self) -> np.ndarray:
-        return np.asarray(self.adaptation.n_episodes < self.n_exploration_episodes)
 
     def deviation(self) -> np.ndarray:
         return np.where(self.exploring()[:, None], 1.0, super().deviation())

@@ -1,18 +1,15 @@
 """Episode Clustering (EC): relabelling when the data comes in."""
 
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch as th
 
 from sb3_htr.common.checks import check_flags
 from sb3_htr.common.type_aliases import Trajectory
-from sb3_htr.htr.episode_store import EpisodeStore
-from sb3_htr.htr.relabel.base import HindsightDraw, Relabeller
+from sb3_htr.htr.relabel.base import HindsightDraw
+from sb3_htr.htr.relabel.hindsight_buffers import HindsightBuffers
 from sb3_htr.htr.relabel.hindsight_task import HindsightTaskStrategy, solved_at_start
-
-if TYPE_CHECKING:
-    from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 
 
 class Discretiser(Protocol):
@@ -49,7 +46,7 @@ class GridDiscretiser:
         return (np.round(tasks / self.cell_size) * self.cell_size + 0).astype(np.float32)
 
 
-class EpisodeClustering(Relabeller):
+class EpisodeClustering(HindsightBuffers):
     """
     Relabels each finished episode at once (HTR paper, B.3 and Algorithm 2), and keeps hindsight buffers of its own.
 
@@ -90,46 +87,16 @@ class EpisodeClustering(Relabeller):
         self.hindsight_task_strategy = HindsightTaskStrategy.of(hindsight_task_strategy)
         self.prefer_unsolved = prefer_unsolved
 
-    def bind(self, buffer: "MultiTaskReplayBuffer") -> None:
-        super().bind(buffer)
-        self.reset()
-
     def reset(self) -> None:
-        own = self.buffer.episodes
-        self.episodes = EpisodeStore(0, own.episodes_per_task, own.episode_length, self.buffer.transitions.width)
+        self.make_buffers(0)
         self._tasks: list[np.ndarray] = []
         self._buffer_of: dict[bytes, int] = {}
 
-    @property
-    def n_hindsight_buffers(self) -> int:
-        """Number of hindsight tasks that were reached so far, after discretisation."""
-        return self.episodes.n_tasks
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of memory that the episodes of all hindsight buffers take."""
-        return self.episodes.nbytes
-
-    def rewarded_fraction(self) -> tuple[float, float]:
-        """
-        :return: share of the stored episodes with a reward beside the task-free one, in the real and in the hindsight buffers
-        """
-        return self.buffer.rewarded_fraction(self.buffer.episodes), self.buffer.rewarded_fraction(self.episodes)
-
-    def stats(self) -> dict[str, float]:
-        real, hindsight = self.rewarded_fraction()
-        return {
-            "replay/rewarded_fraction_real": real,
-            "replay/rewarded_fraction_hindsight": hindsight,
-            "replay/n_hindsight_buffers": self.n_hindsight_buffers,
-            "replay/hindsight_megabytes": self.nbytes / 1e6,
-        }
-
     def state_dict(self) -> dict[str, Any]:
-        return {"episodes": self.episodes.state_dict(), "tasks": th.from_numpy(np.array(self._tasks, dtype=np.float32))}
+        return {**super().state_dict(), "tasks": th.from_numpy(np.array(self._tasks, dtype=np.float32))}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.episodes.load_state_dict(state["episodes"])
+        super().load_state_dict(state)
         self._tasks = list(state["tasks"].numpy().copy())
         self._buffer_of = {task.tobytes(): i for i, task in enumerate(self._tasks)}
 
@@ -168,7 +135,4 @@ class EpisodeClustering(Relabeller):
 
     def draw(self, tasks: np.ndarray) -> HindsightDraw:
         chosen = self.buffer.relabel_rng.integers(self.n_hindsight_buffers, size=len(tasks))
-        index = self.episodes.index()
-        context = index.latest_episodes(chosen, self.buffer.context_episodes)
-        hindsight_tasks = np.stack([self._tasks[i] for i in chosen])
-        return HindsightDraw(self.episodes, context, index.all_episodes(chosen), hindsight_tasks, is_relabelled=True)
+        return self.draw_from(chosen, np.stack([self._tasks[i] for i in chosen]))

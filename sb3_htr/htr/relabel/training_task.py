@@ -1,20 +1,17 @@
 """Relabelling under training tasks: what HFR and HIPI share."""
 
 from abc import abstractmethod
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch as th
 
 from sb3_htr.common.checks import check_numbers
-from sb3_htr.htr.episode_store import EpisodeStore
-from sb3_htr.htr.relabel.base import HindsightDraw, Relabeller
-
-if TYPE_CHECKING:
-    from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
+from sb3_htr.htr.relabel.base import HindsightDraw
+from sb3_htr.htr.relabel.hindsight_buffers import HindsightBuffers
 
 
-class TrainingTaskRelabelling(Relabeller):
+class TrainingTaskRelabelling(HindsightBuffers):
     """
     Experience goes to the hindsight buffers of training tasks. A unit of it, an episode or a transition, goes to the task psi
     with probability
@@ -48,14 +45,8 @@ class TrainingTaskRelabelling(Relabeller):
         :return: (n_units, n_tasks), utility of each unit for each training task. As many units as episodes or as transitions
         """
 
-    def bind(self, buffer: "MultiTaskReplayBuffer") -> None:
-        super().bind(buffer)
-        self.reset()
-
     def reset(self) -> None:
-        own = self.buffer.episodes
-        width = self.buffer.transitions.width
-        self.episodes = EpisodeStore(self.buffer.n_tasks, own.episodes_per_task, own.episode_length, width)
+        self.make_buffers(self.buffer.n_tasks)
         self._new: list[np.ndarray] = []
         # Of the units that came in last: mean entropy of q in nats
         self._entropy = 0.0
@@ -69,9 +60,7 @@ class TrainingTaskRelabelling(Relabeller):
         is_empty = np.diff(index.task_episode)[tasks] == 0
         borrowed = index.tasks[buffer.relabel_rng.integers(len(index.tasks), size=len(tasks))]
         chosen = np.where(is_empty, borrowed, tasks)
-        context = index.latest_episodes(chosen, buffer.context_episodes)
-        hindsight_tasks = buffer.task_family.train_tasks[chosen]
-        return HindsightDraw(self.episodes, context, index.all_episodes(chosen), hindsight_tasks, is_relabelled=True)
+        return self.draw_from(chosen, buffer.task_family.train_tasks[chosen])
 
     def _take_in(self) -> None:
         """Relabel and store what has come in."""
@@ -103,24 +92,19 @@ class TrainingTaskRelabelling(Relabeller):
         return chosen
 
     def stats(self) -> dict[str, float]:
-        return {
-            "replay/relabelling_entropy": self._entropy,
-            "replay/n_hindsight_buffers": len(self.episodes.index().tasks),
-            "replay/rewarded_fraction_real": self.buffer.rewarded_fraction(self.buffer.episodes),
-            "replay/rewarded_fraction_hindsight": self.buffer.rewarded_fraction(self.episodes),
-        }
+        return {**super().stats(), "replay/relabelling_entropy": self._entropy}
 
     def state_dict(self) -> dict[str, Any]:
         new = np.concatenate([np.zeros((0, self.buffer.transitions.width), dtype=np.float32), *self._new])
         return {
-            "episodes": self.episodes.state_dict(),
+            **super().state_dict(),
             "new": th.from_numpy(new),
             "lengths": th.tensor([len(episode) for episode in self._new], dtype=th.int64),
             "entropy": self._entropy,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.episodes.load_state_dict(state["episodes"])
+        super().load_state_dict(state)
         self._new = [episode.numpy().copy() for episode in state["new"].split(state["lengths"].tolist())]
         self._entropy = state["entropy"]
 

@@ -9,6 +9,7 @@ from matplotlib.patches import Circle
 
 from htr_envs import Trajectory
 from sb3_htr.adaptation.evaluation import AdaptationRecord
+from sb3_htr.adaptation.first_success import first_success
 from sb3_htr.zoo.plots.style import BLUE, GREEN, GREY, ORANGE, save, span_unit_if_flat
 
 
@@ -87,17 +88,17 @@ def plot_adaptation_paths(
         axes.set_visible(False)
     for axes, task in zip(grid.flat, order, strict=False):
         successes = record.successes[task]
-        first = int(successes.argmax()) if successes.any() else len(successes)
+        first = int(first_success(successes))
         axes.add_patch(Circle(tasks[task], goal_radius or 0.03, facecolor=GREEN, alpha=0.35, edgecolor=GREEN))
         # A step's achieved task is where it led; the start is not part of it
         ways = record.achieved[task]
         if start is not None:
             ways = np.concatenate([np.broadcast_to(start, (len(ways), 1, 2)), ways], axis=1)
-        for episode, way in enumerate(ways):
+        for episode, way in enumerate(ways, start=1):
             line = {"color": GREY, "alpha": 0.8, "linewidth": 1.0} if episode < first else {"color": BLUE, "linewidth": 1.2}
             axes.plot(way[:, 0], way[:, 1], **line)
         axes.plot(ways[-1, :, 0], ways[-1, :, 1], color=ORANGE, linewidth=2)
-        text = f"solved in episode {first + 1}" if successes.any() else "not solved"
+        text = f"solved in episode {first}" if successes.any() else "not solved"
         axes.set_title(f"task {task + 1}: {text},\nlast return {record.returns[task, -1]:.1f}", fontsize=9)
         axes.set_aspect("equal")
         axes.spines[["top", "right"]].set_visible(False)

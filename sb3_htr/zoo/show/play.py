@@ -20,7 +20,6 @@ class Moment:
     A reset or a step.
 
     :param task: number of the task, from 1 on
-    :param n_tasks: how many there are in its set
     :param n_episodes: adaptation episodes on it
     :param step: steps of the episode so far, 0 at the reset
     :param returns: of the episodes so far, the current one last
@@ -32,7 +31,6 @@ class Moment:
     """
 
     task: int
-    n_tasks: int
     n_episodes: int
     step: int
     returns: tuple[float, ...]
@@ -136,7 +134,7 @@ class Player:
             deviation = float(adaptation.deviation()[0])
             scores = tuple(returns), tuple(successes)
             frame = self.camera.next_frame()
-            return Moment(number, len(tasks), n_episodes, step, *scores, exploring, deviation, ended, frame)
+            return Moment(number, n_episodes, step, *scores, exploring, deviation, ended, frame)
 
         def begin() -> Moment:
             returns.append(0.0)
