@@ -28,8 +28,9 @@ class SingleEpisodeRelabelling(Relabeller):
         episode alone, actor and critics never learn the way to a task from where other tasks lead. By measurement, on a
         two-link arm (one seed): acting with the z of each training task solves .97 of them at 0, all at .25 and .5
     :param prefer_unsolved: of several candidates, a task that was solved already where its episode began is chosen only if all
-        are, and as many from episodes of all tasks, drawn seven times. An object that nobody touched is where it was, and ``"even"`` does not see it where objects begin elsewhere in
-        each episode. Of one candidate (``"random"``, ``"final"``) there is nothing to prefer
+        are, and as many others from episodes of all tasks, drawn seven times. An object that nobody touched is where it was,
+        and ``"even"`` does not see it where objects begin elsewhere in each episode. Of one candidate (``"random"``,
+        ``"final"``) there is nothing to prefer
     :raises ValueError: for an unknown strategy or source, or a share out of [0, 1]
     """
 

@@ -17,7 +17,7 @@ from sb3_htr.zoo.plots.adaptation import plot_adaptation_curve, plot_adaptation_
 from sb3_htr.zoo.plots.curves import Curve, plot_curves
 from sb3_htr.zoo.plots.latent import plot_latent_space
 from sb3_htr.zoo.run.agents import TrainedAgent, find_runs
-from sb3_htr.zoo.run.solved import time_to_solved
+from sb3_htr.zoo.run.learned import time_to_learned
 
 EXAMPLE = """  sb3-htr plot --env SparsePointRobot-v0                  an agent that comes with the package
   sb3-htr plot runs/htr runs/sparse -l HTR "no relabelling"    the runs in a folder are the seeds of its curve
@@ -154,12 +154,12 @@ def learning_curve(label: str, agents: Sequence[TrainedAgent]) -> Curve | None:
     return Curve(steps / 1000, returns, successes, agents[0].method)
 
 
-def print_time_to_solved(groups: dict[str, list[TrainedAgent]]) -> None:
+def print_time_to_learned(groups: dict[str, list[TrainedAgent]]) -> None:
     """
     :param groups: label and runs of each curve: one line for each of them, with the median over runs
     """
     for label, agents in groups.items():
-        times = [time for agent in agents if agent.folder is not None and (time := time_to_solved(agent.folder)) is not None]
+        times = [time for agent in agents if agent.folder is not None and (time := time_to_learned(agent.folder)) is not None]
         if times:
             steps, seconds = np.median(times, axis=0)
             clock = "" if np.isnan(seconds) else f", {seconds:,.0f} seconds with evaluations"
@@ -193,7 +193,7 @@ def main(argv: Sequence[str]) -> None:
             names = [agent.explorer for agents in groups.values() for agent in agents]
             about = f"{env_id}, validation tasks, {about_explorers(names)}"
             plot_curves(learning, new("learning_curves"), about, "thousand env steps of meta-training", labels)
-            print_time_to_solved(groups)
+            print_time_to_learned(groups)
         else:
             print("No learning curves: there is no evaluations.npz of a training.")
     if set(args.only) != {"learning"}:

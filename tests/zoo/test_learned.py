@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_htr.zoo.run.solved import seconds_at, time_to_solved
+from sb3_htr.zoo.run.learned import seconds_at, time_to_learned
 
 N_TASKS, N_EPISODES = 3, 2
 
@@ -27,13 +27,13 @@ def write_run(folder: Path, returns: list[float], log: str | None = None) -> Pat
     [([0, 9, 9.6, 9.4, 10], 3000), ([0, 0, 0], 1000), ([-50, -13, -10, -10], 3000), ([0, 12, 10], 2000), ([10], 1000)],
 )
 def test_solved_is_95_percent_of_the_way_to_the_last_evaluation(tmp_path: Path, returns: list[float], steps: int) -> None:
-    time = time_to_solved(write_run(tmp_path, returns))
+    time = time_to_learned(write_run(tmp_path, returns))
     assert time is not None and time[0] == steps and math.isnan(time[1])
 
 
 def test_seconds_are_those_of_the_log_between_rollouts(tmp_path: Path) -> None:
     log = "time/total_timesteps,eval/mean_reward,time/time_elapsed\n0,,0\n1000,3.5,\n4000,,8\n"
-    assert time_to_solved(write_run(tmp_path, [0, 0, 10], log)) == (3000, 6.0)
+    assert time_to_learned(write_run(tmp_path, [0, 0, 10], log)) == (3000, 6.0)
 
 
 def test_a_run_that_went_on_took_as_long_as_both_parts(tmp_path: Path) -> None:
@@ -44,4 +44,4 @@ def test_a_run_that_went_on_took_as_long_as_both_parts(tmp_path: Path) -> None:
 
 
 def test_a_run_without_evaluations_says_nothing(tmp_path: Path) -> None:
-    assert time_to_solved(tmp_path) is None
+    assert time_to_learned(tmp_path) is None

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 
 # Of the way from the lowest evaluation to the last
-SOLVED = 0.95
+LEARNED = 0.95
 
 
-def time_to_solved(run: Path) -> tuple[int, float] | None:
+def time_to_learned(run: Path) -> tuple[int, float] | None:
     """
     :param run: folder of a training with evaluations
     :return: env steps until the return of the last adaptation episode on the validation tasks first came 95 % of the way from
@@ -20,8 +20,8 @@ def time_to_solved(run: Path) -> tuple[int, float] | None:
         return None
     with np.load(run / "evaluations.npz") as evaluations:
         steps, returns = evaluations["timesteps"], evaluations["returns"][:, :, -1].mean(axis=1)
-    is_solved = returns >= returns.min() + SOLVED * (returns[-1] - returns.min())
-    first = steps[is_solved.argmax()]
+    is_learned = returns >= returns.min() + LEARNED * (returns[-1] - returns.min())
+    first = steps[is_learned.argmax()]
     return int(first), float(seconds_at(run / "progress.csv", np.array([first]))[0])
 
 
