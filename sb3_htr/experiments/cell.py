@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 KwArgs = dict[str, Any]
 
 
@@ -84,8 +86,22 @@ class Cell:
         """
         :return: what its numbers are of, as JSON
         """
-        names = ("env_id", "env_kwargs", "method", "settings", "seed", "n_timesteps", "n_episodes")
+        names = ("env_id", "env_kwargs", "method", "settings", "seed", "n_timesteps", "n_episodes", "eval_freq")
         return json.dumps({name: getattr(self, name) for name in names}, sort_keys=True)
+
+    def check_result(self, path: Path) -> None:
+        """
+        :param path: raw results; those of older versions say less of what they are of, or nothing
+        :raises ValueError: if they are of something else
+        """
+        raw = np.load(path)
+        given, own = json.loads(str(raw["cell"])) if "cell" in raw else {}, json.loads(self.facts())
+        if different := [name for name, value in given.items() if value != own.get(name)]:
+            name = different[0]
+            raise ValueError(
+                f"{path} has {name} {given[name]!r}, but {self.experiment}/{self.name} needs {own.get(name)!r}: move it away "
+                "with its run, or choose other --runs."
+            )
 
     def training(self, folder: Path) -> list[str]:
         """

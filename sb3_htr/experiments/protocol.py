@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from sb3_htr.adaptation.evaluation import evaluate_adaptation
+from sb3_htr.adaptation.explorers import to_explorer
 from sb3_htr.adaptation.first_success import first_success
 from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.vec_env import make_task_vec_env
@@ -13,6 +14,7 @@ from sb3_htr.experiments.ablations import ABLATIONS
 from sb3_htr.experiments.calibration import calibration
 from sb3_htr.experiments.cell import Cell, KwArgs
 from sb3_htr.zoo.run.algorithm import Model
+from sb3_htr.zoo.run.method import OWN
 
 # A final model adapts to all test tasks once for each: of starting states, and of all that an explorer draws
 EVAL_SEEDS = (1, 2, 3, 4, 5)
@@ -24,10 +26,12 @@ SOLVED_SHARE = 0.8
 Raw = Mapping[str, np.ndarray]
 
 
-def evaluate(cell: Cell, model: Model) -> KwArgs:
+def evaluate(cell: Cell, model: Model, trained_with: Any = None) -> KwArgs:
     """
     :param cell: says which evaluations
     :param model: at the end of its training
+    :param trained_with: explorer as the hyperparameters of its training give it. Its settings hold where it is meant; those
+        that are not given are today's defaults, as for all explorers, whatever they were when the model was trained
     :return: ``returns_<evaluation>`` float32 and ``successes_<evaluation>`` bool, (n_eval_seeds, n_tasks, n_episodes); and
         ``calibration``, see :func:`sb3_htr.experiments.calibration.calibration`
     """
@@ -36,13 +40,20 @@ def evaluate(cell: Cell, model: Model) -> KwArgs:
         env_kwargs = {**cell.env_kwargs, **evaluation.tested_on}
         family = get_task_family(make_task_vec_env(cell.env_id, env_kwargs=env_kwargs))
         env = make_task_vec_env(cell.env_id, len(family.test_tasks), env_kwargs=env_kwargs)
-        explorer = ABLATIONS.get(evaluation.explorer, evaluation.explorer)
+        explorer = _explorer(evaluation.explorer, trained_with)
         records = [
             evaluate_adaptation(model, env, n_episodes=cell.n_episodes, explorer=explorer, seed=seed) for seed in EVAL_SEEDS
         ]
         returns, successes = (np.stack(arrays) for arrays in zip(*records, strict=True))
         arrays |= {f"returns_{evaluation.name}": returns.astype(np.float32), f"successes_{evaluation.name}": successes}
     return {**arrays, "calibration": calibration(model, cell.env_id, cell.env_kwargs)}
+
+
+def _explorer(name: str, trained_with: Any) -> Any:
+    if name in ABLATIONS or name == OWN:
+        return ABLATIONS.get(name, name)
+    is_meant = isinstance(trained_with, Mapping) and trained_with.get("name") == name
+    return to_explorer(trained_with if is_meant else name)
 
 
 def last_episode_return(raw: Raw, evaluation: str) -> np.ndarray:

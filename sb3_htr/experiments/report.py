@@ -130,9 +130,10 @@ def _rounded(interval: tuple[float, float, float]) -> dict[str, float]:
 def check(results: dict[Cell, Path]) -> None:
     """
     :param results: raw results of cells
-    :raises ValueError: if one lacks something, as those of older versions do
+    :raises ValueError: if one is of something else, or lacks something, as those of older versions do
     """
     for cell, path in results.items():
+        cell.check_result(path)
         needed = {"solved", "elapsed_s", *COMMITS, *(f"returns_{evaluation.name}" for evaluation in cell.evaluations)}
         if missing := sorted(needed - set(np.load(path).files)):
             raise ValueError(

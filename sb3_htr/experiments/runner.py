@@ -60,7 +60,7 @@ def run_cell(cell: Cell, runs: Path) -> bool:
     try:
         with claim(cell, runs).acquire(timeout=0):
             if result.exists():
-                _check_facts(cell, result)
+                cell.check_result(result)
             else:
                 with _logged(folder / "log.txt"):
                     arrays = _train_and_evaluate(cell, folder)
@@ -85,6 +85,7 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
     evaluations = np.load(run / "evaluations.npz")
     progress = np.genfromtxt(run / "progress.csv", delimiter=",", names=True, deletechars="")
     logged = progress.dtype.names or ()
+    record = read_record(run / RECORD)
     return {
         **{key: np.nanmean(progress[f"train/{key}"]) if f"train/{key}" in logged else np.nan for key in LOGGED},
         "timesteps": evaluations["timesteps"],
@@ -93,9 +94,9 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
         "elapsed_s": seconds_at(run / "progress.csv", evaluations["timesteps"]),
         "cell": cell.facts(),
         # Of the code as it was when the training began, and as it is now
-        "commit": named(read_record(run / RECORD)),
+        "commit": named(record),
         "evaluation_commit": named(commit()),
-        **evaluate(cell, model),
+        **evaluate(cell, model, record["hyperparams"].get("explorer")),
     }
 
 
@@ -133,16 +134,6 @@ def _settings(arguments: list[str]) -> set[str]:
     after = arguments[arguments.index("-params") + 1 :] if "-params" in arguments else []
     options = {**ALWAYS, **{option: value for option, value in pairwise(arguments) if option in ALWAYS}}
     return {*takewhile(lambda word: not word.startswith("-"), after), f"--eval-episodes {options['--eval-episodes']}"}
-
-
-def _check_facts(cell: Cell, result: Path) -> None:
-    """Results of older versions do not say what they are of."""
-    raw = np.load(result)
-    if "cell" in raw and raw["cell"] != cell.facts():
-        raise ValueError(
-            f"{result} is of {raw['cell']}, but {cell.experiment}/{cell.name} is {cell.facts()}: move it away with its run, "
-            "or choose other --runs."
-        )
 
 
 @contextmanager

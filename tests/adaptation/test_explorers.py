@@ -182,6 +182,24 @@ def test_what_was_learnt_in_one_env_stays_there(tiny_pearl: MakePEARL) -> None:
     np.testing.assert_array_equal(both[0][:1], alone[0])
 
 
+def test_a_shorter_episode_beside_it_changes_nothing(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    know_tasks(model, 9)
+
+    def search(lengths: np.ndarray) -> list[float]:
+        adaptation, places = begin(model, "belief", len(lengths)), []
+        for i in range(1, 141):
+            adaptation.explorer.look(np.zeros((len(lengths), 2), dtype=np.float32))
+            place = adaptation.z[:, 0].copy()
+            adaptation.observe(step(np.stack([place, place], axis=1), np.zeros(len(lengths)), i % lengths == 0))
+            places.append(float(place[0]))
+        return places
+
+    alone = search(np.array([200]))
+    assert (np.diff(alone) != 0).all(), "in a first episode, z is chosen at each step"
+    assert search(np.array([200, 80])) == alone
+
+
 def test_it_repeats_the_best_episode_unless_another_task_promises_more(tiny_pearl: MakePEARL) -> None:
     """Particle 1 is said to return 20 under task 0, and does not."""
     model = tiny_pearl()

@@ -1,6 +1,7 @@
 """From raw results to tables and pictures. The runs are made up; what is said of them must be true."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ def made_up(cells: list[Cell], folder: Path) -> dict[Cell, Path]:
             "solved": np.arange(20) < np.array([[0], [15], [16], [20]]),
             "elapsed_s": np.arange(1.0, 5.0),
         }
-        arrays |= {"commit": "abc", "evaluation_commit": "abc", **{key: 0.5 for key in LOGGED}}
+        arrays |= {"cell": cell.facts(), "commit": "abc", "evaluation_commit": "abc", **{key: 0.5 for key in LOGGED}}
         arrays["calibration"] = np.tile([[4.0, 1.0, 2.0]], (10, 1))
         for evaluation in cell.evaluations:
             returns = float(cell.seed + len(evaluation.tested_on))
@@ -120,6 +121,9 @@ def test_a_result_of_an_older_version_is_named_before_anything_is_written(tmp_pa
     np.savez(path, **{key: value for key, value in np.load(path).items() if key != "solved"})
     with pytest.raises(ValueError, match=rf"{path.name} is of another version, and lacks \['solved'\]: remove it"):
         report.write("", EXPERIMENTS["held_out_sector"], results, tmp_path / "results")
+    changed = {replace(cell, n_timesteps=7): path for cell, path in results.items()}
+    with pytest.raises(ValueError, match=r"has n_timesteps 150000, but held_out_sector/.* needs 7: move it away"):
+        report.write("", EXPERIMENTS["held_out_sector"], changed, tmp_path / "results")
     assert not (tmp_path / "results").exists()
 
 

@@ -11,10 +11,12 @@ import pytest
 
 from helpers import ENV_ID
 from sb3_htr import PEARL, evaluate_adaptation, make_task_vec_env
+from sb3_htr.adaptation.explorers import Prior
 from sb3_htr.common.resume import checkpoints
 from sb3_htr.experiments import grid
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.grid import Experiment, Variant, by
+from sb3_htr.experiments.protocol import evaluate
 from sb3_htr.experiments.runner import find_finished, run_cell
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.commands import train
@@ -135,8 +137,13 @@ def test_explorers_and_episodes_are_those_of_the_experiment(tmp_path: Path) -> N
     assert np.load(run / "evaluations.npz")["returns"].shape == (1, 20, 3)
     raw = np.load(cell.result(tmp_path))
     assert raw["returns_prior"].shape == raw["returns_aggregate"].shape == (2, 4, 3)
-    by_itself, _ = evaluate_adaptation(model, make_task_vec_env(ENV_ID, 4, env_kwargs=cell.env_kwargs), n_episodes=3, seed=1)
+    env = make_task_vec_env(ENV_ID, 4, env_kwargs=cell.env_kwargs)
+    by_itself, _ = evaluate_adaptation(model, env, n_episodes=3, seed=1)
     assert (raw["returns_prior"][0] == by_itself.astype(np.float32)).all()
+    # What nobody has set is as it is today, for all explorers of a table, whatever it was when the model was saved
+    as_today, _ = evaluate_adaptation(model, env, n_episodes=3, explorer=Prior(), seed=1)
+    assert (evaluate(cell, model)["returns_prior"][0] == as_today.astype(np.float32)).all()
+    assert (as_today != by_itself).any()
 
 
 def test_one_cell_of_a_job_array_writes_no_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -52,7 +52,8 @@ class Belief(ParticleExplorer):
         self._at_start = np.ones(n_envs, dtype=bool)
         self._searching = np.ones(n_envs, dtype=bool)
         self._n_steps = np.zeros(n_envs, dtype=np.int64)
-        self._every = 1
+        # Steps from one choice within an episode to the next
+        self._every = np.ones(n_envs, dtype=np.int64)
         # Of all episodes, and of those with one z
         self._best_return = np.zeros(n_envs)
         self._best_z = np.zeros_like(self.z)
@@ -69,7 +70,8 @@ class Belief(ParticleExplorer):
 
     def final_z(self) -> np.ndarray:
         """
-        :return: (n_envs, latent_dim), z of the best episode, or, where none was rewarded, the one to be acted with next
+        :return: (n_envs, latent_dim), z of the best episode of those with one z, or, where none of these was rewarded, the one
+            that was acted with last
         """
         return np.where((self._best_z_return > 0)[:, None], self._best_z, self.z)
 
@@ -122,7 +124,7 @@ class Belief(ParticleExplorer):
         self._n_steps += 1
         ended = np.flatnonzero(step.dones)
         if len(ended):
-            self._every = max(self._every, int(self._n_steps.max()) // N_CHOICES)
+            self._every[ended] = np.maximum(self._every[ended], self._n_steps[ended] // N_CHOICES)
             self._end(ended)
 
     def _end(self, envs: np.ndarray) -> None:

@@ -94,4 +94,7 @@ class SingleEpisodeRelabelling(Relabeller):
         if task.shape[1] == 1:
             return np.ones(task.shape[:2])
         first = Trajectory(*(values[:MAX_COMPARED, 0] for values in reached))
-        return 1 + self.buffer.task_family.is_success(first, task[:, :, None])[..., 0].sum(axis=-1)
+        alike = self.buffer.task_family.is_success(first, task[:, :, None])[..., 0]
+        own = np.arange(alike.shape[-1])
+        alike[own, 0, own] = False
+        return 1 + alike.sum(axis=-1)
