@@ -428,8 +428,9 @@ class OffPolicyMetaAlgorithm(AtomicSave, Resumable, SAC):
 
         :param env: env with the task, or an id. It need not be of the task family that the model knows, or of any: an env of
             the same spaces, such as the real robot, is enough, if its episodes are all of one task
-        :param n_episodes: episodes to adapt in. The agent then acts with the z of the best one, or with a draw from its
-            posterior where none was tried yet (explorer ``"prior"``: with a draw from the posterior over all of them)
+        :param n_episodes: episodes to adapt in. The agent then acts as :meth:`Explorer.final_z` of the explorer says: by
+            ``"belief"``, with the z of the best one that had a single z, else with the z it acted with last; by ``"prior"``, with
+            a draw from the posterior over all of them
         :param task: index of a training task or task vector; by default the task that the env has (if it has none yet, one
             is drawn). The env keeps it. An env without task family takes none
         :param explorer: an explorer, its name, or its name and settings; the model's own by default
