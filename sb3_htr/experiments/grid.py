@@ -204,6 +204,16 @@ ALL = (
         eval_freq=75_000,
         evaluations=by(BELIEF),
     ),
+    Experiment(
+        "fetch_push",
+        "An arm that pushes a block to a place which it is not told: HTR, and PEARL without relabelling.",
+        "HiddenFetchPush-v0",
+        1_000_000,
+        tuple(map(Variant, ("htr-ser", "pearl-sparse"))),
+        seeds=3,
+        eval_freq=100_000,
+        evaluations=by(BELIEF),
+    ),
     # RL2 learns slowly; SAC and HER are told the task, and learn fast. Further away there is no training task to relabel under
     Experiment(
         "rivals",
