@@ -35,6 +35,8 @@ class GoalEnvSource:
     """The id with its arguments."""
     spec: EnvSpec = field(repr=False, compare=False)
     """The registration, of a copy that has the arguments; what is pickled needs no registry where it is unpickled."""
+    entry_point: Any = field(repr=False)
+    """What makes it: the same id may be registered again, for another class."""
 
     @classmethod
     def find(cls, env_id: str | EnvSpec, env_kwargs: dict[str, Any]) -> GoalEnvSource:
@@ -47,7 +49,8 @@ class GoalEnvSource:
         """
         spec = copy.deepcopy(_find_spec(env_id) if isinstance(env_id, str) else env_id)
         spec.kwargs.update(env_kwargs)
-        return cls(f"{spec.id}({', '.join(f'{key}={value!r}' for key, value in sorted(spec.kwargs.items()))})", spec)
+        arguments = ", ".join(f"{key}={value!r}" for key, value in sorted(spec.kwargs.items()))
+        return cls(f"{spec.id}({arguments})", spec, spec.entry_point)
 
     def dense(self) -> GoalEnvSource | None:
         """The same env with its dense reward, None where it has no argument ``reward_type``."""

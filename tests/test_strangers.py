@@ -1,8 +1,10 @@
 """Files from strangers, made to run code, to take memory or to confuse: each is answered in one sentence, and runs nothing."""
 
+import base64
 import hashlib
 import io
 import json
+import pickle
 import sys
 import zipfile
 from collections.abc import Callable
@@ -15,12 +17,13 @@ import yaml
 from stable_baselines3.common.utils import LinearSchedule
 
 from helpers import ENV_ID, MakePEARL
-from helpers.bombs import bombs
+from helpers.bombs import Bomb, bombs
 from helpers.runs import make_run
 from sb3_htr import load_untrusted
 from sb3_htr.common.checkpoint import MANIFEST, DamagedCheckpoint, read_checkpoint, write_checkpoint
+from sb3_htr.common.plain import load_plain
 from sb3_htr.common.resume import checkpoints
-from sb3_htr.zoo.cli import main
+from sb3_htr.zoo.cli import console, main
 from sb3_htr.zoo.commands.optimize import create_study
 from sb3_htr.zoo.run.agents import RECORD, agent_at
 
@@ -189,26 +192,28 @@ def with_data(key: str, value: Any) -> Callable[[dict[str, Any], dict[str, Any]]
 # Of the data and the weights of a model file, what a stranger may make
 MODELS: dict[str, Callable[[dict[str, Any], dict[str, Any]], dict[str, bytes]]] = {
     **{
-        f"its {key} is {value!r:.20}": with_data(key, value)
-        for key, value in (
-            ("policy_kwargs", {"net_arch": [10**9]}),
-            ("policy_kwargs", {"net_arch": [2**14] * 10**4}),
-            ("policy_kwargs", {"net_arch": "evil"}),
-            ("policy_kwargs", {"latent_dim": -1}),
-            ("policy_kwargs", {"latent_dim": True}),
-            ("policy_kwargs", {"encoder_class": "evil.X"}),
-            ("policy_kwargs", [1]),
-            ("context_size", 10**8),
-            ("explorer", "evil.X"),
-            ("explorer", {"name": "evil.X"}),
-            ("explorer", {"name": "prior", "n_exploration_episodes": "evil"}),
-            ("explorer", None),
-            ("gamma", 7),
-            ("tau", -1),
-            ("learning_rate", {":type:": str(LinearSchedule), "start": "evil", "end": 0, "end_fraction": 1}),
-            ("learning_rate", {":type:": str(LinearSchedule)}),
-            ("meta_batch_size", 0.5),
-            ("replay_buffer_kwargs", {"relabeller": "evil.X"}),
+        f"{i}, its {key} is {value!r:.20}": with_data(key, value)
+        for i, (key, value) in enumerate(
+            (
+                ("policy_kwargs", {"net_arch": [10**9]}),
+                ("policy_kwargs", {"net_arch": [2**14] * 10**4}),
+                ("policy_kwargs", {"net_arch": "evil"}),
+                ("policy_kwargs", {"latent_dim": -1}),
+                ("policy_kwargs", {"latent_dim": True}),
+                ("policy_kwargs", {"encoder_class": "evil.X"}),
+                ("policy_kwargs", [1]),
+                ("context_size", 10**8),
+                ("explorer", "evil.X"),
+                ("explorer", {"name": "evil.X"}),
+                ("explorer", {"name": "prior", "n_exploration_episodes": "evil"}),
+                ("explorer", None),
+                ("gamma", 7),
+                ("tau", -1),
+                ("learning_rate", {":type:": str(LinearSchedule), "start": "evil", "end": 0, "end_fraction": 1}),
+                ("learning_rate", {":type:": str(LinearSchedule)}),
+                ("meta_batch_size", 0.5),
+                ("replay_buffer_kwargs", {"relabeller": "evil.X"}),
+            )
         )
     },
     "its data are no JSON": lambda data, weights: {"data": b"evil"},
@@ -239,6 +244,54 @@ def test_model_files(
     with pytest.raises(ValueError) as refusal:
         load_untrusted(tmp_path / "hostile.zip", ENV_ID)
     assert "\n" not in str(refusal.value)
+
+
+def test_a_model_to_begin_with(fuse: Path, tmp_path: Path, tiny_pearl: MakePEARL) -> None:
+    """Its weights are taken, and its pickles are not."""
+    model, hostile = tiny_pearl(), tmp_path / "hostile.zip"
+    model.save(tmp_path / "model.zip")
+    pickled = base64.b64encode(pickle.dumps(Bomb(fuse))).decode()
+    with zipfile.ZipFile(tmp_path / "model.zip") as source, zipfile.ZipFile(hostile, "w") as archive:
+        for name in source.namelist():
+            content = source.read(name)
+            if name == "data":
+                content = json.dumps({**json.loads(content), "x": {":type:": "x", ":serialized:": pickled}}).encode()
+            archive.writestr(name, content)
+    settings = ["learning_starts:10_000", "n_envs:4", "gradient_steps:1"]
+    arguments = ["--env", ENV_ID, "-n", "240", "--eval-freq", "-1", "--verbose", "0", "-params", *settings]
+    assert main(["train", "-i", str(hostile), "-f", str(tmp_path / "logs"), *arguments]) == 0
+    assert not fuse.exists()
+    trained, given = agent_at(tmp_path / "logs", "last").load().policy.state_dict(), model.policy.state_dict()
+    assert all(th.equal(trained[name], given[name]) for name in given if not name.startswith("normalizer"))
+    with pytest.raises(ValueError, match="is unpickled to be trained on, which can run any code: add --trust"):
+        main(["train", "--method", "sac-her", "-i", str(hostile), "-f", str(tmp_path / "logs"), *arguments[:-1]])
+
+
+def test_calls_that_take_memory(tmp_path: Path) -> None:
+    """torch would let them through."""
+
+    class Large:
+        def __reduce__(self) -> Any:
+            return bytearray, (10**6,)
+
+    with zipfile.ZipFile(tmp_path / "large.pt", "w") as archive:
+        archive.writestr("archive/data.pkl", pickle.dumps({"x": Large()}, protocol=2))
+        archive.writestr("archive/version", "3")
+    with pytest.raises(ValueError, match="it calls what no tensor needs"):
+        load_plain(tmp_path / "large.pt")
+
+
+def test_modules_of_the_working_folder_wait_for_the_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "of_my_own.py").write_text("")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.path", [path for path in sys.path if path not in ("", str(tmp_path))])
+    look = ["enjoy", "--env", ENV_ID, "--no-render", "--n-episodes", "1", "--n-tasks", "1"]
+    monkeypatch.setattr("sys.argv", ["sb3-htr", *look])
+    assert console() == 0 and str(tmp_path) not in sys.path
+    monkeypatch.setattr("sys.argv", ["sb3-htr", *look, "--gym-packages", "of_my_own"])
+    assert console() == 0 and "of_my_own" in sys.modules
 
 
 # --- checkpoints

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import torch as th
 from torch import nn
-from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 # Products of fewer multiplications are left to MKL, which begins sooner, and batches of fewer rows to torch.nn; by measurement
@@ -77,8 +76,11 @@ class _Stack(th.autograd.Function):
         return x
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, grad: th.Tensor) -> tuple[th.Tensor | None, ...]:
+        if th.is_grad_enabled():
+            raise RuntimeError(
+                "Fast layers have no second derivatives (create_graph): use torch.nn.Linear and torch.nn.Sequential."
+            )
         saved = iter(ctx.saved_tensors)
         steps = [(layer, [next(saved) for _ in range(3 if layer.eps is None else 8)]) for layer in ctx.layers]
         needs_x, _, *needed = ctx.needs_input_grad

@@ -1,6 +1,8 @@
 """Tensors, numbers and text from files of unknown origin."""
 
 import os
+import pickletools
+import re
 import zipfile
 from collections.abc import Iterator
 from typing import IO, Any
@@ -9,6 +11,8 @@ import torch as th
 
 # What a file may unpack to
 MAX_BYTES = 2**30
+# What its pickle may call, beside types of storages
+CALLED = ("torch._utils _rebuild_tensor_v2", "collections OrderedDict")
 
 
 def load_plain(file: str | os.PathLike[str] | IO[bytes]) -> Any:
@@ -28,6 +32,9 @@ def load_plain(file: str | os.PathLike[str] | IO[bytes]) -> Any:
         # torch does not look at the checksums
         if archive.testzip() is not None:
             raise ValueError("it is not what was written.")
+        for name in archive.namelist():
+            if name.endswith("data.pkl"):
+                _check_pickle(archive.read(name))
     if not isinstance(file, str | os.PathLike):
         file.seek(0)
     content = th.load(file, map_location="cpu", weights_only=True)
@@ -38,6 +45,14 @@ def load_plain(file: str | os.PathLike[str] | IO[bytes]) -> Any:
     if enlarged or sum(tensor.nbytes for tensor in tensors) > 2 * size:
         raise ValueError("its tensors are larger than what is stored of them.")
     return content
+
+
+def _check_pickle(data: bytes) -> None:
+    """torch lets a file call more than that, of which some take any memory at once."""
+    for opcode, argument, _ in pickletools.genops(data):
+        named = opcode.name == "GLOBAL" and (argument in CALLED or re.fullmatch(r"torch \w+Storage", str(argument)))
+        if opcode.name in ("STACK_GLOBAL", "INST", "OBJ", "EXT1", "EXT2", "EXT4") or (opcode.name == "GLOBAL" and not named):
+            raise ValueError("it calls what no tensor needs.")
 
 
 def _tensors(content: Any) -> Iterator[th.Tensor]:

@@ -173,11 +173,10 @@ class CheckpointCallback(BaseCallback):
         try:
             write_checkpoint(folder, self._state())
         except WRITE_ERRORS as error:
-            warnings.warn(
-                f"The checkpoint {folder} could not be written ({reason(error)}). Training goes on, and tries again before "
-                "the next rollout.",
-                stacklevel=2,
-            )
+            then = "Training goes on, and tries again before the next rollout."
+            if self._stopped:
+                then = "Training stops as it was asked to: what was trained since the checkpoint before is lost."
+            warnings.warn(f"The checkpoint {folder} could not be written ({reason(error)}). {then}", stacklevel=2)
             return
         self._last_calls = self.n_calls
         if self.verbose > 0:

@@ -57,11 +57,15 @@ class Resumable(BaseAlgorithm):
     def _get_random_state(self) -> dict[str, Any]:
         assert self.env is not None
         envs = [get_generator_state(generator) for generator in self.env.get_attr("np_random")]
-        return {"global": get_global_state(), "envs": envs}
+        # Random actions at the beginning are SB3's
+        actions = get_generator_state(self.action_space.np_random)
+        return {"global": get_global_state(), "envs": envs, "actions": actions}
 
     def _set_random_state(self, state: dict[str, Any]) -> None:
         assert self.env is not None
         set_global_state(state["global"])
+        if "actions" in state:  # which older versions have not saved
+            set_generator_state(self.action_space.np_random, state["actions"])
         for i, (generator, saved) in enumerate(zip(self.env.get_attr("np_random"), state["envs"], strict=True)):
             set_generator_state(generator, saved)
             self.env.set_attr("np_random", generator, indices=i)

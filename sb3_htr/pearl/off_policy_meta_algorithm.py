@@ -428,11 +428,11 @@ class OffPolicyMetaAlgorithm(AtomicSave, Resumable, SAC):
 
         :param env: env with the task, or an id. It need not be of the task family that the model knows, or of any: an env of
             the same spaces, such as the real robot, is enough, if its episodes are all of one task
-        :param n_episodes: episodes to adapt in. The agent then acts as :meth:`Explorer.final_z` of the explorer says: by
-            ``"belief"``, with the z of the best one that had a single z, else with the z it acted with last; by ``"prior"``, with
-            a draw from the posterior over all of them
-        :param task: index of a training task or task vector; by default the task that the env has (if it has none yet, one
-            is drawn). The env keeps it. An env without task family takes none
+        :param n_episodes: episodes to adapt in. The agent then acts with the ``final_z`` of the explorer: of ``"belief"``, z
+            of the best one that had a single z, else the z that it acted with last; of ``"prior"``, a draw from the posterior
+            over all of them
+        :param task: index of a training task or task vector; by default the task that the env was given, or one that it draws.
+            The env keeps it. An env without task family takes none
         :param explorer: an explorer, its name, or its name and settings; the model's own by default
         :param deterministic: adapt with mean actions instead of samples
         :param seed: seed of z

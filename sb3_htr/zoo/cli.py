@@ -88,8 +88,6 @@ def console() -> int:
     """
     :return: exit status of :func:`main`; 1 and a sentence, without the way to it, for an error; 130 after Ctrl-C
     """
-    # Modules of one's own beside what one works on, as `python -m` has it
-    sys.path.append(os.getcwd())
     # Products are small: beside another process, an evaluation on two threads takes three times as long as on one
     if "OMP_NUM_THREADS" not in os.environ:
         th.set_num_threads(1)

@@ -140,3 +140,9 @@ def test_replaced_layers_keep_their_parameters() -> None:
     assert isinstance(module[0], Linear) and isinstance(module[1], Stack) and isinstance(module[1][1], Linear)
     assert all(a is b for a, b in zip(module.parameters(), parameters, strict=True))
     assert all(th.equal(before[name], value) for name, value in module.state_dict().items())
+
+
+def test_second_derivatives_are_refused() -> None:
+    layer, x = Linear(8, 8), th.randn(MIN_ROWS, 8, requires_grad=True)
+    with pytest.raises(RuntimeError, match=r"no second derivatives \(create_graph\)"):
+        th.autograd.grad(layer(x).sum(), x, create_graph=True)

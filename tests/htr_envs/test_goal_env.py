@@ -126,6 +126,22 @@ for _class in (ReachEnv, ChoiceEnv, CostlyEnv, InformedEnv, PlainEnv, DiscreteEn
 TOY, CHOICE = "ToyReachEnv-v0", "ToyChoiceEnv-v0"
 
 
+def test_an_id_that_is_registered_again_is_another_family() -> None:
+    """As in a notebook, where a class is edited: rewards would be those of the former one."""
+
+    def register(radius: float) -> HiddenGoalFamily:
+        class Edited(ReachEnv):
+            def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+                return -(np.linalg.norm(achieved_goal - desired_goal, axis=-1) > radius).astype(np.float32)
+
+        gym.registry.pop("ToyEdited-v0", None)
+        gym.register("ToyEdited-v0", entry_point=Edited, max_episode_steps=30)
+        return HiddenGoalFamily("ToyEdited-v0")
+
+    near, far = (register(radius).reached([0.0, 0.0], [0.2, 0.0]) for radius in (0.1, 0.3))
+    assert not near and far
+
+
 def make(env_id: str, **kwargs: Any) -> tuple[gym.Env[Any, Any], HiddenGoalEnv]:
     env = gym.make(env_id, **kwargs)
     base = env.unwrapped

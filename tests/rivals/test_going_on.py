@@ -22,13 +22,18 @@ def rl2() -> RL2:
     return RL2("MlpLstmPolicy", env, 2, n_trials_per_rollout=1, n_epochs=1, seed=0, policy_kwargs=nets)
 
 
-def sac_her() -> SACHER:
+def sac_her(learning_starts: int = 0) -> SACHER:
     env = make_task_vec_env(ENV_ID, 4, seed=0)
     # The buffer is full and begins anew within the run
-    return SACHER("MultiInputPolicy", env, 2, seed=0, policy_kwargs={"net_arch": [4]}, learning_starts=0, buffer_size=200)
+    nets = {"net_arch": [4]}
+    return SACHER("MultiInputPolicy", env, 2, seed=0, policy_kwargs=nets, learning_starts=learning_starts, buffer_size=200)
 
 
-@pytest.mark.parametrize("make", [rl2, sac_her])
+def with_random_actions() -> SACHER:
+    return sac_her(3 * ROLLOUT)
+
+
+@pytest.mark.parametrize("make", [rl2, sac_her, with_random_actions])
 def test_it_goes_on_exactly(make: Callable[[], Any]) -> None:
     # One at a time: they share the global generators
     unbroken = make().learn(4 * ROLLOUT)

@@ -198,6 +198,8 @@ def test_normalized_agents_are_exported_with_their_statistics(tmp_path: Path, ti
 def test_the_command_of_a_record_is_that_of_any_machine(defaults: list[str]) -> None:
     """What the trained agent was trained by, without local folders, and with the seed that was drawn."""
     arguments = ["--algo", "pearl", "-conf", "/home/me/pearl.yml", "--num-threads", "1", *defaults]
+    study = ["--storage", "postgresql://me:secret@db/x", "--study-name=x", "--trial-id", "7", "--tensorboard-log=/home/me/tb"]
+    arguments += [*study, "-conf", "/home/me/my.yml", "-i", "/home/me/agent.zip"]
     arguments += ["--env", ENV_ID, "-f", "/home/me/runs", "-P", "--seed", "3", "-params", "policy_kwargs:{'latent_dim': 3}"]
     command = model_card.training_command({"arguments": arguments, "seed": 4, "method": "htr-ec"})
     params = "-params 'policy_kwargs:{'\"'\"'latent_dim'\"'\"': 3}'"

@@ -132,6 +132,7 @@ def test_a_learning_rate_decays_anew_when_training_further(tmp_path: Path) -> No
         [NETS[-1].replace("}", ",'normalize_observations':True}"), "ent_coef:'auto'", "learning_rate:'lin_1e-3'"],
         ["train_explorer:'belief'", "explorer:{'name':'prior','n_exploration_episodes':1}"],
         ["env_wrapper:'gymnasium.wrappers.OrderEnforcing'"],  # single envs instead of a batch
+        ["policy_kwargs:dict(net_arch=[8],encoder_arch=[8],activation_fn=nn.Tanh)"],  # what JSON has not
     ],
 )
 def test_runs_of_all_kinds_go_on_exactly(settings: list[str], tmp_path: Path) -> None:

@@ -118,6 +118,7 @@ def main(argv: Sequence[str]) -> None:
     if args.film:
         from sb3_htr.zoo.commands import record as recording
 
-        recording.main([str(file), "-o", str(output / FILM), "--verbose", "0", *["--trust"] * args.trust])
+        packages = ["--gym-packages", *args.gym_packages] if args.gym_packages else []
+        recording.main([str(file), "-o", str(output / FILM), "--verbose", "0", *["--trust"] * args.trust, *packages])
     if repo_id is not None:
         print(f"Uploaded to {push(output, repo_id, name, args.private)}")

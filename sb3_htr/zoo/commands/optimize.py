@@ -105,7 +105,10 @@ def main(argv: Sequence[str]) -> None:
         print(f"No trial learnt anything: the return after adaptation is 0 in all {len(values)}. Make the trials longer (-n).")
     else:
         command = ["sb3-htr", "train", "--env", args.env, *(["--method", args.method] if args.method else [])]
-        command += ["--study-name", args.study_name, "--storage", args.storage, "--trial-id", str(study.best_trial.number)]
+        storage = args.storage
+        if not storage.endswith(".log"):  # *** in place of a password
+            storage = sqlalchemy.make_url(storage).render_as_string()
+        command += ["--study-name", args.study_name, "--storage", storage, "--trial-id", str(study.best_trial.number)]
         given = {"--gym-packages": args.gym_packages, "-conf": args.conf_file, "--env-kwargs": args.env_kwargs}
         for option, values in {**given, "-params": args.hyperparams}.items():
             command += [option, *values] if values else []

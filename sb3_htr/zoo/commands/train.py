@@ -13,7 +13,7 @@ from sb3_htr.zoo.run.arguments import default_arguments, given_arguments
 from sb3_htr.zoo.run.manager import run_rl_zoo
 from sb3_htr.zoo.run.memory import keep_freed_memory
 from sb3_htr.zoo.run.method import DEFAULT, get_method, methods
-from sb3_htr.zoo.run.trust import CONF, check_arguments, import_packages
+from sb3_htr.zoo.run.trust import CONF, check_arguments, import_packages, see_working_folder
 
 HELP = """sb3-htr train: rl_zoo3's train (its arguments follow) with evaluations that adapt to validation tasks.
 
@@ -89,6 +89,7 @@ def main(argv: Sequence[str]) -> None:
     else:
         if not wants_help and not env:
             raise ValueError("--env is missing: give the id of a task env, as in `sb3-htr train --env SparsePointRobot-v0`.")
+        see_working_folder()  # for what -params and -conf name
         packages = ["--gym-packages", *args.gym_packages] if args.gym_packages else []
         for i, (before, word) in enumerate(pairwise(rest), start=1):
             if before in CONF and Path(word).exists():

@@ -37,13 +37,15 @@ from sb3_htr.common.resume import CheckpointCallback, checkpoints, cut_monitor_f
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.common.versions import commit, versions
 from sb3_htr.pearl.divergence import DivergedError
+from sb3_htr.pearl.pearl import PEARL
+from sb3_htr.pearl.untrusted import load_untrusted
 from sb3_htr.zoo.run.agents import RECORD, read_record
 from sb3_htr.zoo.run.algorithm import Algorithm
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback, ProgressCallback
 from sb3_htr.zoo.run.folder import claim, lock
 from sb3_htr.zoo.run.method import DEFAULT, PEARLMethod, get_method, merged, names_of
 from sb3_htr.zoo.run.search_space import convert_pearl_params, sample_pearl_params
-from sb3_htr.zoo.run.trust import plain_settings
+from sb3_htr.zoo.run.trust import plain_settings, refuse
 
 # What a YAML file may have beside the arguments of the algorithm
 ZOO_SETTINGS = ("n_envs", "n_timesteps", "env_wrapper", "vec_env_wrapper", "callback", "env_kwargs")
@@ -235,6 +237,21 @@ class MetaExperimentManager(ExperimentManager):
                 model.env.close()
                 self._lock.release()
 
+    def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+        if self.trust:
+            return super()._load_pretrained_agent(hyperparams, env)
+        if self.method.algorithm.model_class() is not PEARL:
+            raise refuse(self.trained_agent, "is unpickled to be trained on")
+        print("Loading pretrained agent")
+        given = {key: value for key, value in hyperparams.items() if key not in ("policy", "policy_kwargs")}
+        logged = {"seed": self.seed, "tensorboard_log": self.tensorboard_log, "verbose": self.verbose}
+        model = load_untrusted(self.trained_agent, env, self.device, **given, **logged)
+        replay_buffer = Path(self.trained_agent).with_name("replay_buffer.pkl")
+        if replay_buffer.exists():
+            print("Loading replay buffer")
+            model.load_replay_buffer(replay_buffer)
+        return model
+
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         """
         :param model: at the end of its training
@@ -274,7 +291,7 @@ class MetaExperimentManager(ExperimentManager):
         used = {**saved_hyperparams, "n_timesteps": self.n_timesteps}
         if self.resumed is not None:
             record = read_record(self.resumed / RECORD)
-            before, now = record["hyperparams"], json.loads(json.dumps(used))
+            before, now = record["hyperparams"], json.loads(json.dumps(used, default=str))
             is_longer = before["n_timesteps"] < now["n_timesteps"]
             changed = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
             if changed and not (is_longer and changed == ["n_timesteps"]):

@@ -25,8 +25,10 @@ SHOWN = (1, 2, 3, 5, 10)
 PEARL = "PEARL (Rakelly et al., 2019)"
 OF_EXPLORERS = """ The explorer says how z is chosen before the first reward;
 `prior` is the protocol of PEARL's paper."""
-# Arguments of a training that change nothing of its result, with the number of their values
+# Arguments of a training that change nothing of its result, or name what is on one machine alone, with the number of their
+# values. What a study or a file of settings brought is among the hyperparameters of the card
 LOCAL = {"-f": 1, "--log-folder": 1, "-tb": 1, "--tensorboard-log": 1, "-P": 0, "--progress": 0, "--verbose": 1, "--seed": 1}
+LOCAL |= dict.fromkeys(("--storage", "--study-name", "--trial-id", "-conf", "--conf-file", "-i", "--trained-agent"), 1)
 
 
 def training_command(record: dict[str, Any]) -> str:
@@ -40,8 +42,9 @@ def training_command(record: dict[str, Any]) -> str:
     words: list[str] = []
     while arguments:
         word = arguments.pop(0)
-        if word in LOCAL:
-            del arguments[: LOCAL[word]]
+        option, equals, _ = word.partition("=")
+        if option in LOCAL:
+            del arguments[: 0 if equals else LOCAL[option]]
         else:
             words.append(word)
     return shlex.join(["sb3-htr", "train", *words, "--seed", str(record["seed"])])

@@ -5,6 +5,8 @@ not, unless the user says ``--trust``.
 
 import ast
 import importlib
+import os
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -122,6 +124,12 @@ def _is_literal(text: str) -> bool:
     return True
 
 
+def see_working_folder() -> None:
+    """Modules of one's own beside what one works on can be imported from now on, as with `python -m`: the user names some."""
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
+
+
 def import_packages(named: Iterable[str], asked_for: Iterable[str] = (), file: object = "", trust: bool = False) -> None:
     """
     :param named: modules that register envs, by the user
@@ -131,6 +139,8 @@ def import_packages(named: Iterable[str], asked_for: Iterable[str] = (), file: o
     :raises ValueError: for one that is not there, or that a file may not have imported
     """
     named = list(named)
+    if named or trust:
+        see_working_folder()
     for name in asked_for:
         if name not in (*named, *PACKAGES) and not trust:
             raise ValueError(
