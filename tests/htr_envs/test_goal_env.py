@@ -134,8 +134,9 @@ def test_an_id_that_is_registered_again_is_another_family() -> None:
             def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
                 return -(np.linalg.norm(achieved_goal - desired_goal, axis=-1) > radius).astype(np.float32)
 
+        made_by: Any = Edited
         gym.registry.pop("ToyEdited-v0", None)
-        gym.register("ToyEdited-v0", entry_point=Edited, max_episode_steps=30)
+        gym.register("ToyEdited-v0", entry_point=made_by, max_episode_steps=30)
         return HiddenGoalFamily("ToyEdited-v0")
 
     near, far = (register(radius).reached([0.0, 0.0], [0.2, 0.0]) for radius in (0.1, 0.3))
