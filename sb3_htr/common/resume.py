@@ -121,9 +121,16 @@ class CheckpointCallback(BaseCallback):
 
         :param model: to be trained by ``learn(remaining steps, reset_num_timesteps=False)`` with this callback
         :param state: of :func:`load_latest`
+        :raises ValueError: for other callbacks than it was begun with
         """
+        callbacks = (self, *self.companions)
+        if len(callbacks) != len(state["callbacks"]):
+            raise ValueError(
+                f"The training was begun with {len(state['callbacks']) - 1} companions of its CheckpointCallback, and goes on "
+                f"with {len(self.companions)}: give it the same callbacks, in the same order."
+            )
         model.load_state_dict(state["model"])
-        for callback, remembered in zip((self, *self.companions), state["callbacks"], strict=True):
+        for callback, remembered in zip(callbacks, state["callbacks"], strict=True):
             callback.n_calls = remembered["n_calls"]
             if isinstance(callback, HasState):
                 callback.load_state_dict(remembered["state"])

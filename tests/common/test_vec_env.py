@@ -1,5 +1,7 @@
 """Batched envs as SB3 wants them."""
 
+from pathlib import Path
+
 import gymnasium as gym
 import pytest
 
@@ -7,8 +9,11 @@ from helpers import ENV_ID
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
 
 
-def test_an_id_can_name_the_module_that_registers_it() -> None:
-    assert make_task_vec_env(f"htr_envs:{ENV_ID}").num_envs == 1
+def test_an_id_can_name_the_module_that_registers_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    code = "import gymnasium\ngymnasium.register('OfMine-v0', entry_point='htr_envs:PointRobotEnv', max_episode_steps=9)\n"
+    (tmp_path / "of_mine.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert make_task_vec_env("of_mine:OfMine-v0").num_envs == 1
 
 
 def test_options_of_a_batch_must_agree() -> None:

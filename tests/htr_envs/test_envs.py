@@ -109,7 +109,12 @@ def test_rewards_of_step_are_reproduced_bit_for_bit(env_id: str) -> None:
 def test_pickled_env_and_family_go_on_alike(env_id: str) -> None:
     env, base = make(env_id)
     env.reset(options={"task_id": 3})
+    actions = [env.action_space.sample() for _ in range(6)]
+    for action in actions[:3]:
+        env.step(action)
     twin = pickle.loads(pickle.dumps(env))
+    for action in actions[3:]:
+        assert data_equivalence(env.step(action), twin.step(action), exact=True)
     assert data_equivalence(play(env, 1, options={"task_id": 3}), play(twin, 1, options={"task_id": 3}), exact=True)
     family = pickle.loads(pickle.dumps(base.task_family))
     for name in ("train_tasks", "validation_tasks", "test_tasks"):

@@ -18,6 +18,7 @@ from gymnasium import spaces
 from gymnasium.error import DependencyNotInstalled
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
+from helpers.drawing import skip_where_mujoco_cannot_draw
 from htr_envs import HiddenGoalEnv, HiddenGoalFamily, Trajectory, check_task_env, goal_env_source, hide_goal
 from htr_envs.goal_env import find_hidden
 from sb3_htr import PEARL, evaluate_adaptation
@@ -454,12 +455,10 @@ def test_processes_of_their_own_play_the_same(env_id: str) -> None:
 
 @fetch_reach
 def test_pictures_have_the_hidden_goal_and_change_nothing(env_id: str) -> None:
+    skip_where_mujoco_cannot_draw()
     env, base = make(env_id, render_mode="rgb_array")
     env.reset()
-    try:
-        env.render()
-    except Exception as error:
-        pytest.skip(f"MuJoCo cannot draw on this machine: {error!r}")
+    env.render()
     plain, actions, last = make(env_id)[0], actions_of(env, 10), []
     for task in base.test_tasks[:2]:
         expected, _ = play(plain, actions, seed=0, options={"task": task})

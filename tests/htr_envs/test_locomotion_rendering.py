@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import data_equivalence
 
+from helpers.drawing import skip_where_mujoco_cannot_draw
 from helpers.robots import both_envs, make, random_actions, robots
 from htr_envs import DynamicsEnv
 
 
 def picture(env: DynamicsEnv) -> Any:
-    try:
-        frame = env.render()
-    except Exception as error:
-        pytest.skip(f"this machine cannot render: {error!r}")
+    skip_where_mujoco_cannot_draw()
+    frame = env.render()
     assert frame is not None and frame.shape == (400, 640, 3) and frame.dtype == np.uint8
     return frame.astype(int)
 

@@ -15,7 +15,7 @@ from helpers import parameters as parameters_of
 from helpers.disks import disk
 from helpers.runs import run_folder, train_arguments
 from sb3_htr import PEARL
-from sb3_htr.common.resume import CheckpointCallback, checkpoints
+from sb3_htr.common.resume import CheckpointCallback, checkpoints, load_latest
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run.callbacks import ProgressCallback
@@ -99,6 +99,9 @@ def test_a_lost_progress_file_is_written_anew(tiny_pearl: MakePEARL, tmp_path: P
     column = rows[0].split(",").index("time/total_timesteps")
     assert [int(row.split(",")[column]) for row in rows[1:]] == [240, 480, 720, 960, 1200], "nothing of it is lost"
     assert [folder.name for folder in checkpoints(tmp_path)] == ["1200_steps", "960_steps"]
+    _, state = load_latest(tmp_path)
+    with pytest.raises(ValueError, match=r"begun with 1 companions of its CheckpointCallback, and goes on with 0"):
+        CheckpointCallback(1, str(tmp_path)).restore(tiny_pearl(), state)
 
 
 def test_an_old_checkpoint_that_cannot_be_removed_ends_no_training(
