@@ -22,6 +22,7 @@ from sb3_htr import PEARL
 from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.commands import optimize, train
+from sb3_htr.zoo.commands.optimize import without_password
 from sb3_htr.zoo.run.method import PEARLMethod, get_method, merged, methods
 from sb3_htr.zoo.run.search_space import ENCODER_ARCHS, convert_pearl_params, sample_pearl_params
 
@@ -110,6 +111,12 @@ def test_workers_that_begin_at_once_share_a_study_in_postgresql(postgresql: str,
     with ThreadPoolExecutor(4) as pool:
         studies = list(pool.map(lambda _: optimize.create_study(postgresql, "race"), range(4)))
     assert len({study._study_id for study in studies}) == 1
+
+
+def test_no_password_is_printed() -> None:
+    for storage in ("logs/study.log", "sqlite:///study.db", "postgresql+psycopg://me@/x?host=/tmp/socket"):
+        assert without_password(storage) == storage
+    assert without_password("postgresql+psycopg://me:secret@db/x") == "postgresql+psycopg://me:***@db/x"
 
 
 def test_a_study_in_postgresql(postgresql: str, quick: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

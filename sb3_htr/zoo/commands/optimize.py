@@ -105,14 +105,21 @@ def main(argv: Sequence[str]) -> None:
         print(f"No trial learnt anything: the return after adaptation is 0 in all {len(values)}. Make the trials longer (-n).")
     else:
         command = ["sb3-htr", "train", "--env", args.env, *(["--method", args.method] if args.method else [])]
-        storage = args.storage
-        if not storage.endswith(".log"):  # *** in place of a password
-            storage = sqlalchemy.make_url(storage).render_as_string()
-        command += ["--study-name", args.study_name, "--storage", storage, "--trial-id", str(study.best_trial.number)]
+        command += ["--study-name", args.study_name, "--storage", without_password(args.storage)]
+        command += ["--trial-id", str(study.best_trial.number)]
         given = {"--gym-packages": args.gym_packages, "-conf": args.conf_file, "--env-kwargs": args.env_kwargs}
         for option, values in {**given, "-params": args.hyperparams}.items():
             command += [option, *values] if values else []
         print(f"Train with the best trial so far: {shlex.join(command)}")
+
+
+def without_password(storage: str) -> str:
+    """
+    :param storage: file of a journal (``.log``), or URL of a database
+    :return: the same, with *** in place of a password
+    """
+    url = None if storage.endswith(".log") else sqlalchemy.make_url(storage)
+    return storage if url is None or url.password is None else url.render_as_string()
 
 
 def _is_news(record: logging.LogRecord) -> bool:
