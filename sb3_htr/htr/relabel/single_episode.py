@@ -1,5 +1,7 @@
 """Single Episode Relabelling (SER): relabelling when experience is drawn."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from sb3_htr.common.checks import check_flags, check_numbers
@@ -11,6 +13,22 @@ from sb3_htr.htr.relabel.hindsight_task import HindsightTaskStrategy, solved_at_
 MAX_COMPARED = 64
 # Times that candidates are drawn anew, from episodes of all tasks, where the start solves all of them
 MAX_REDRAWS = 7
+
+
+class Candidates(NamedTuple):
+    """
+    For hindsight tasks.
+
+    :param episode: (n, n_candidates) int
+    :param step: (n, n_candidates) int, virtual row of one of its steps
+    :param task: (n, n_candidates, task_dim) float32, what this step reached
+    :param is_solved: (n, n_candidates) bool, whether the start of the episode solves that, where this is asked
+    """
+
+    episode: np.ndarray
+    step: np.ndarray
+    task: np.ndarray
+    is_solved: np.ndarray
 
 
 class SingleEpisodeRelabelling(Relabeller):
@@ -52,16 +70,16 @@ class SingleEpisodeRelabelling(Relabeller):
 
     def draw(self, tasks: np.ndarray) -> HindsightDraw:
         buffer, strategy, index = self.buffer, self.hindsight_task_strategy, self.buffer.episodes.index()
-        episode, step, is_solved = self._candidates(index.task_episode[tasks], index.task_episode[tasks + 1])
+        candidates = self._candidates(index.task_episode[tasks], index.task_episode[tasks + 1])
         for _ in range(MAX_REDRAWS):
-            again = np.flatnonzero(is_solved.all(axis=1))
+            again = np.flatnonzero(candidates.is_solved.all(axis=1))
             if len(again) == 0:
                 break
             anywhere = np.zeros_like(again), np.full_like(again, len(index.episode_row) - 1)
-            episode[again], step[again], is_solved[again] = self._candidates(*anywhere)
-        reached = self._steps(step)
-        hindsight_task = buffer.task_family.hindsight_task(reached, 0)
-        count = self._count_alike(reached, hindsight_task)
+            for values, others in zip(candidates, self._candidates(*anywhere), strict=True):
+                values[again] = others
+        episode, step, hindsight_task, is_solved = candidates
+        count = self._count_alike(self._steps(step[:MAX_COMPARED, 0]), hindsight_task)
         chosen = np.arange(len(tasks)), strategy.choose(count, buffer.relabel_rng, is_solved)
         episode = episode[chosen]
         batch = context = np.stack([index.episode_row[episode], index.episode_row[episode + 1]], axis=1)
@@ -69,31 +87,28 @@ class SingleEpisodeRelabelling(Relabeller):
             batch = index.all_episodes(np.searchsorted(index.task_episode, episode, side="right") - 1)
         return HindsightDraw(buffer.episodes, context, batch, hindsight_task[chosen], False, self.elsewhere)
 
-    def _candidates(self, first: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """
-        Some episodes of each range (n,), the virtual row of one step of each, and whether the start of the episode solves what
-        this step reached. (n, n_candidates) each.
-        """
+    def _candidates(self, first: np.ndarray, end: np.ndarray) -> Candidates:
+        """Of each range of episodes (n,), some episodes and one step of each."""
         rng, index, strategy = self.buffer.relabel_rng, self.buffer.episodes.index(), self.hindsight_task_strategy
         n = len(first), strategy.n_candidates
         episode = first[:, None] + (rng.random(n) * (end - first)[:, None]).astype(np.int64)
         start, end = index.episode_row[episode], index.episode_row[episode + 1]
         step = start + strategy.steps(end - start, rng)
-        if not self.prefer_unsolved or strategy.n_candidates == 1:
-            return episode, step, np.zeros(episode.shape, dtype=bool)
         family = self.buffer.task_family
-        return episode, step, solved_at_start(family, self._steps(start), family.hindsight_task(self._steps(step), 0))
+        task, is_solved = family.hindsight_task(self._steps(step), 0), np.zeros(n, dtype=bool)
+        if self.prefer_unsolved and strategy.n_candidates > 1:
+            is_solved = solved_at_start(family, self._steps(start), task)
+        return Candidates(episode, step, task, is_solved)
 
     def _steps(self, virtual: np.ndarray) -> Trajectory:
         """(..., 1, dim), each virtual row as a trajectory of its own."""
         episodes = self.buffer.episodes
         return self.buffer.transitions.trajectory(episodes.rows[episodes.index().rows[virtual]][..., None, :])
 
-    def _count_alike(self, reached: Trajectory, task: np.ndarray) -> np.ndarray:
+    def _count_alike(self, first: Trajectory, task: np.ndarray) -> np.ndarray:
         """(n, n_candidates), how many of some other rows solve each candidate's task with their first candidate, plus 1."""
         if task.shape[1] == 1:
             return np.ones(task.shape[:2])
-        first = Trajectory(*(values[:MAX_COMPARED, 0] for values in reached))
         alike = self.buffer.task_family.is_success(first, task[:, :, None])[..., 0]
         own = np.arange(alike.shape[-1])
         alike[own, 0, own] = False
