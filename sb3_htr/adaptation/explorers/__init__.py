@@ -2,7 +2,7 @@ from sb3_htr.adaptation.explorers.aggregate import Aggregate
 from sb3_htr.adaptation.explorers.base import Explorer
 from sb3_htr.adaptation.explorers.belief import Belief
 from sb3_htr.adaptation.explorers.learned_prior import LearnedPrior
-from sb3_htr.adaptation.explorers.prior import Prior
+from sb3_htr.adaptation.explorers.prior import FixedExploration, Prior
 from sb3_htr.common.settings import make
 
 # For YAML files
@@ -24,4 +24,4 @@ def to_explorer(explorer: object) -> Explorer:
     return make("explorer", explorer, EXPLORERS, Explorer)
 
 
-__all__ = ["EXPLORERS", "Aggregate", "Belief", "Explorer", "LearnedPrior", "Prior", "to_explorer"]
+__all__ = ["EXPLORERS", "Aggregate", "Belief", "Explorer", "FixedExploration", "LearnedPrior", "Prior", "to_explorer"]
