@@ -128,6 +128,19 @@ def task_from_options(options: dict[str, Any] | None) -> tuple[str, Any] | None:
     return next(iter(options.items()))
 
 
+def checked_action(action: ArrayLike, space: spaces.Space[Any]) -> NDArray[np.float32]:
+    """A float32 copy of an action, or of one for each env.
+
+    :raises ValueError: if it has another shape than those of the space, or a number that is not finite.
+    """
+    checked = np.array(action, dtype=np.float32)
+    if checked.shape != space.shape:
+        raise ValueError(f"The action has shape {checked.shape}, expected {space.shape}: pass one action for each env.")
+    if not np.isfinite(checked).all():
+        raise ValueError(f"The action is {checked}, expected finite numbers: look for where it comes from.")
+    return checked
+
+
 class MetaEnv(gym.Env[FloatArray, FloatArray], ABC):
     """An environment that is given tasks, which may change its rewards, dynamics and terminations.
 
@@ -215,7 +228,7 @@ class MetaEnv(gym.Env[FloatArray, FloatArray], ABC):
 
         :param action: the action, shape (act_dim,).
         :return: next observation (obs_dim,), reward, terminated, False, info.
-        :raises ValueError: if the action has the wrong shape.
+        :raises ValueError: if the action has the wrong shape, or is not finite.
         :raises gymnasium.error.ResetNeeded: before the first reset.
         """
         _, observation, reward, terminated = self._checked_step(action)
@@ -229,9 +242,7 @@ class MetaEnv(gym.Env[FloatArray, FloatArray], ABC):
         """
         if self._observation is None:
             raise ResetNeeded("step was called before the first reset: call env.reset() first.")
-        action = np.array(action, dtype=np.float32)
-        if action.shape != self.action_space.shape:
-            raise ValueError(f"The action has shape {action.shape}, expected {self.action_space.shape}: pass one action.")
+        action = checked_action(action, self.action_space)
         state, reward, terminated = self._step_state(action)
         return action, self._remember_observation(state), reward, terminated
 

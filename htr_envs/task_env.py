@@ -202,7 +202,7 @@ class TaskEnv(MetaEnv):
 
         :param action: the action, shape (act_dim,).
         :return: next observation (obs_dim,), reward, terminated, False, info.
-        :raises ValueError: if the action has the wrong shape.
+        :raises ValueError: if the action has the wrong shape, or is not finite.
         :raises gymnasium.error.ResetNeeded: before the first reset.
         """
         before = self._observation

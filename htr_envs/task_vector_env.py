@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from htr_envs.meta_env import task_from_options
+from htr_envs.meta_env import checked_action, task_from_options
 from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, check_reward_type
 
 
@@ -149,16 +149,12 @@ class TaskVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]], ABC):
 
         :param actions: the actions, shape (num_envs, act_dim).
         :return: observations (num_envs, obs_dim), rewards, terminations, truncations (num_envs,), infos as in the class.
-        :raises ValueError: if the actions have the wrong shape.
+        :raises ValueError: if the actions have the wrong shape, or are not finite.
         :raises gymnasium.error.ResetNeeded: before the first reset.
         """
         if self._observations is None:
             raise ResetNeeded("step was called before the first reset: call reset() first.")
-        actions = np.array(actions, dtype=np.float32)
-        if actions.shape != self.action_space.shape:
-            raise ValueError(
-                f"The actions have shape {actions.shape}, expected {self.action_space.shape}: pass a row for each env."
-            )
+        actions = checked_action(actions, self.action_space)
         states, task_free_reward, terminated = self._step_state(actions)
         final_obs = np.array(states, dtype=np.float32)
         # an axis of T = 1 makes every copy a trajectory of its own, with its own task

@@ -397,6 +397,10 @@ def test_wrong_use_is_refused(env_id: str) -> None:
         base.step(calls[1][1])
     with pytest.raises(ValueError, match="shape"):
         vector.step(calls[0][1])
+    for step, action in calls:
+        action[..., -1] = np.nan
+        with pytest.raises(ValueError, match=r"nan.*expected finite numbers"):
+            step(action)
     for build in (lambda: gym.make(env_id, reward_type="shaped"), lambda: make_vec(env_id, 2, reward_type="shaped")):
         with pytest.raises(ValueError, match="reward_type"):
             build()
