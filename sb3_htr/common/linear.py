@@ -187,7 +187,7 @@ class Linear(nn.Linear):
 class Stack(nn.Sequential):
     """
     ``nn.Sequential`` with the same parameters and results, for linear layers, layer normalization and ReLU. Of other modules,
-    and where :class:`Linear` is ``nn.Linear``, it is ``nn.Sequential``.
+    of those with hooks or computed weights, and where :class:`Linear` is ``nn.Linear``, it is ``nn.Sequential``.
     """
 
     def forward(self, x: th.Tensor) -> th.Tensor:
@@ -203,7 +203,9 @@ class Stack(nn.Sequential):
         layers: list[_Layer] = []
         for module in self:
             last = layers[-1] if layers else None
-            if isinstance(module, Linear) and module.bias is not None:
+            if _has_hooks(module):
+                return None
+            if type(module) is Linear and module.bias is not None:
                 layers.append(_Layer())
             elif type(module) is nn.LayerNorm and last == _Layer() and module.bias is not None:
                 layers[-1] = _Layer(eps=module.eps)
@@ -212,6 +214,11 @@ class Stack(nn.Sequential):
             else:
                 return None
         return layers
+
+
+def _has_hooks(module: nn.Module) -> bool:
+    """As torch's spectral and weight normalization and its pruning add to a layer. Parametrizations change its class."""
+    return bool(module._forward_pre_hooks or module._forward_hooks or module._backward_pre_hooks or module._backward_hooks)
 
 
 def with_fast_layers(module: nn.Module) -> nn.Module:

@@ -9,6 +9,7 @@ import torch as th
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import nn
+from torch.nn.utils import parametrize, prune
 
 from sb3_htr.common import linear
 from sb3_htr.common.linear import MIN_ROWS, Linear, Stack, find_onednn, with_fast_layers
@@ -146,3 +147,25 @@ def test_second_derivatives_are_refused() -> None:
     layer, x = Linear(8, 8), th.randn(MIN_ROWS, 8, requires_grad=True)
     with pytest.raises(RuntimeError, match=r"no second derivatives \(create_graph\)"):
         th.autograd.grad(layer(x).sum(), x, create_graph=True)
+
+
+@pytest.mark.parametrize("what", ["hook", "spectral_norm", "prune", "parametrization"])
+def test_what_torch_adds_to_a_layer_is_kept(what: str) -> None:
+    """A stack reads the layers' weights: one with a hook, or whose weight is computed, is left to torch."""
+    th.manual_seed(0)
+    layer = nn.Linear(5, 40)
+    plain = nn.Sequential(layer, nn.ReLU(), nn.Linear(40, 3)).eval()
+    stack = with_fast_layers(copy.deepcopy(plain))
+    x = th.randn(2 * MIN_ROWS, 5)
+    for module in (plain, stack):
+        first = module[0]  # type: ignore[index]
+        if what == "hook":
+            first.register_forward_hook(lambda _, __, y: y + 1)
+        elif what == "spectral_norm":
+            th.manual_seed(1)
+            nn.utils.spectral_norm(first).eval()
+        elif what == "prune":
+            prune.ln_structured(first, "weight", amount=0.5, n=2, dim=0)
+        else:
+            parametrize.register_parametrization(first, "weight", nn.Tanh())
+    th.testing.assert_close(stack(x), plain(x))
