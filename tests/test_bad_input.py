@@ -1,9 +1,10 @@
 """Envs and settings that cannot work are refused in one sentence, before any work is lost."""
 
+import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -15,7 +16,7 @@ from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL, many
-from htr_envs import PointRobotEnv, PointRobotVectorEnv, check_task_env
+from htr_envs import PointRobotEnv, PointRobotFamily, PointRobotVectorEnv, check_task_env
 from sb3_htr import PEARL, evaluate_adaptation, load_untrusted
 from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
@@ -464,3 +465,19 @@ def test_a_hindsight_task_that_its_step_does_not_solve_is_named(
     monkeypatch.setattr(type(family), "hindsight_task", lambda self, traj, step: right(traj, step) + 3)
     with pytest.raises(ValueError, match="hindsight_task names a task that its own step does not solve"):
         tiny_pearl(env).learn(ROLLOUT)
+
+
+@pytest.mark.parametrize("factor", [0.1, 1.0, 100.0])
+def test_rewards_of_another_scale_are_warned_of(factor: float, tiny_pearl: MakePEARL) -> None:
+    class Scaled(PointRobotFamily):
+        def compute_reward(self, traj: Any, task: Any, reward_type: str = "sparse") -> Any:
+            return super().compute_reward(traj, task, reward_type) * np.float32(factor)
+
+    env = gym.make(ENV_ID)
+    cast(Any, env.unwrapped).task_family = Scaled()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        tiny_pearl(env, n_tasks_per_rollout=1).learn(1)
+    about = [str(warning.message) for warning in caught if "A success is worth" in str(warning.message)]
+    assert bool(about) == (factor != 1)
+    assert factor == 1 or f"about {factor:.2g} here" in about[0]

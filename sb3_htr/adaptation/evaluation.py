@@ -18,6 +18,7 @@ from sb3_htr.common.checks import (
     get_max_episode_steps,
     get_task_family,
 )
+from sb3_htr.common.random_state import seeded_actions
 from sb3_htr.common.vec_env import make_task_vec_env
 
 
@@ -98,10 +99,7 @@ def run_adaptation(
     steps: list[np.ndarray] = []
     episode_of_step: list[np.ndarray] = []
     act = partial(adaptation.act, deterministic=deterministic)
-    # Actions are drawn by torch's global generator
-    with th.random.fork_rng(enabled=not deterministic):
-        if not deterministic:
-            th.manual_seed(seed)
+    with seeded_actions(seed, deterministic):
         for step in adaptation_steps(env, adaptation, n_episodes, policy.unscale_action, act, obs):
             # Envs that are ahead of the others write to a column that is cut off
             column = np.minimum(episode, n_episodes)

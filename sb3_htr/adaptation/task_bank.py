@@ -62,7 +62,7 @@ class TaskBank:
         self.task_family = task_family
         self.transitions = transitions
         self.context_size = context_size
-        train = task_family.train_tasks
+        train = task_family.train_tasks.astype(np.float32)
         self.n_train = min(len(train), MAX_TRAIN_TASKS)
         self.tasks = train[np.linspace(0, len(train) - 1, self.n_train).round().astype(int)]
         # Returns without the task-free part, 0 where no episode solved the task

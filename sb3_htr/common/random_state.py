@@ -1,7 +1,9 @@
-"""The states of random generators as plain data."""
+"""The states of random generators: as plain data, and for a while another one."""
 
 import json
 import random
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -49,3 +51,17 @@ def set_global_state(state: dict[str, Any]) -> None:
     th.set_rng_state(state["torch"].cpu())
     if state["cuda"]:
         th.cuda.set_rng_state_all([cuda.cpu() for cuda in state["cuda"]])
+
+
+@contextmanager
+def seeded_actions(seed: int, deterministic: bool) -> Iterator[None]:
+    """
+    Actions that are drawn within, by torch's global generator, are those of a seed; then the generator is as it was before.
+
+    :param seed: of the actions
+    :param deterministic: whether none are drawn
+    """
+    with th.random.fork_rng(enabled=not deterministic):
+        if not deterministic:
+            th.manual_seed(seed)
+        yield

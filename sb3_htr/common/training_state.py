@@ -1,6 +1,7 @@
 """What a training in progress is between two rollouts, of any Stable-Baselines3 algorithm, as plain data."""
 
 from collections import deque
+from copy import deepcopy
 from typing import Any, ClassVar
 
 import numpy as np
@@ -25,12 +26,12 @@ class Resumable(BaseAlgorithm):
     def state_dict(self) -> dict[str, Any]:
         """
         :return: everything that a training in progress is, between two rollouts, as tensors, numbers, strings and None; for
-            :meth:`load_state_dict`
+            :meth:`load_state_dict`. A copy: training on does not change it
         """
         log_ent_coef = getattr(self, "log_ent_coef", None)
         return {
-            "parameters": self.get_parameters(),
-            "log_ent_coef": None if log_ent_coef is None else log_ent_coef.detach(),
+            "parameters": deepcopy(self.get_parameters()),
+            "log_ent_coef": None if log_ent_coef is None else log_ent_coef.detach().clone(),
             "counters": {name: getattr(self, name) for name in self.COUNTERS},
             "episode_infos": [{k: _tensor(v) for k, v in info.items()} for info in self.ep_info_buffer or ()],
             "episode_successes": [_tensor(success) for success in self.ep_success_buffer or ()],

@@ -146,7 +146,7 @@ TUNED_DENSE: KwArgs = {
 ALL = (
     Experiment(
         "point_robot",
-        "HTR by both kinds of relabelling, against PEARL as published and with a dense proxy reward.",
+        "HTR by both kinds of relabelling, against PEARL without relabelling and with a dense proxy reward.",
         POINT,
         150_000,
         tuple(map(Variant, ("htr-ser", "htr-ec", "pearl-dense", "pearl-sparse", "pearl-sparse-prior"))),

@@ -1,7 +1,6 @@
 """Turns the raw results of an experiment into ``results/<name>/``."""
 
 import json
-import platform
 from collections.abc import Iterator
 from datetime import date
 from pathlib import Path
@@ -10,13 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.common.versions import processor
 from sb3_htr.experiments import figures
 from sb3_htr.experiments.calibration import expected_calibration_error
 from sb3_htr.experiments.cell import Cell, Evaluation
 from sb3_htr.experiments.grid import Experiment
 from sb3_htr.experiments.protocol import EVAL_SEEDS, METRICS, scores
-from sb3_htr.experiments.runner import LOGGED
+from sb3_htr.experiments.runner import LOGGED, machine
 from sb3_htr.zoo.plots.intervals import iqm_difference, iqm_interval
 
 RETURN = "last_episode_return"
@@ -79,7 +77,8 @@ def summarize(command: str, results: dict[Cell, Path]) -> dict[str, Any]:
         "command": command,
         **{key: ", ".join(sorted({str(raw[key]) for runs in all_runs for raw in runs.raws})) for key in COMMITS},
         "date": date.today().isoformat(),
-        "machine": f"{processor()}, one thread per run, Python {platform.python_version()}",
+        # Older results do not say: they are taken for this one's
+        "machine": ", ".join(sorted({str(raw.get("machine", machine())) for runs in all_runs for raw in runs.raws})),
         "n_eval_seeds": len(EVAL_SEEDS),
         "rows": [row for runs in all_runs for row in _rows(runs)],
         "differences": [row for first, *others in compared for other in others for row in _differences(first, other)],

@@ -1,5 +1,6 @@
 """One cell, in whatever process an executor calls it: claimed, trained from where it was, and evaluated."""
 
+import platform
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
@@ -13,7 +14,7 @@ from filelock import FileLock, Timeout
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.resume import checkpoints
-from sb3_htr.common.versions import commit, named
+from sb3_htr.common.versions import commit, named, processor
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.protocol import evaluate
 from sb3_htr.zoo.commands import train
@@ -36,6 +37,13 @@ def claim(cell: Cell, runs: Path) -> FileLock:
     return FileLock(cell.run_folder(runs) / ".claim")
 
 
+def machine() -> str:
+    """
+    :return: what seconds depend on
+    """
+    return f"{processor()}, one thread per run, Python {platform.python_version()}"
+
+
 def run_cell(cell: Cell, runs: Path) -> bool:
     """
     Train, unless there is a finished run, then evaluate the final model.
@@ -43,7 +51,7 @@ def run_cell(cell: Cell, runs: Path) -> bool:
     The result is an npz with ``timesteps`` and ``elapsed_s``, (n,); ``curve`` and ``solved``, (n, n_tasks), return of the last
     adaptation episode on the validation tasks and whether it solved them; what
     :func:`sb3_htr.experiments.protocol.evaluate` tells of the final model; the means of what is in ``LOGGED``; ``commit`` of
-    the code that trained, and ``evaluation_commit``. What would be printed is in the ``log.txt`` of its folder.
+    the code that trained, ``evaluation_commit`` and ``machine``. What would be printed is in the ``log.txt`` of its folder.
 
     :param cell: what to run
     :param runs: folder of all experiments' runs; a cell that has a result there is not run again
@@ -96,6 +104,7 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
         # Of the code as it was when the training began, and as it is now
         "commit": named(record),
         "evaluation_commit": named(commit()),
+        "machine": machine(),
         **evaluate(cell, model, record["hyperparams"].get("explorer")),
     }
 
@@ -130,10 +139,11 @@ def find_finished(cell: Cell, folder: Path) -> tuple[Path, Model] | None:
 
 
 def _settings(arguments: list[str]) -> set[str]:
-    """Of the arguments of a training, hyperparameters and the number of adaptation episodes."""
+    """Of the arguments of a training: hyperparameters, and what its evaluations are."""
     after = arguments[arguments.index("-params") + 1 :] if "-params" in arguments else []
-    options = {**ALWAYS, **{option: value for option, value in pairwise(arguments) if option in ALWAYS}}
-    return {*takewhile(lambda word: not word.startswith("-"), after), f"--eval-episodes {options['--eval-episodes']}"}
+    options = {**ALWAYS, **dict(pairwise(arguments))}
+    evaluations = {f"{option} {options.get(option)}" for option in ("--eval-episodes", "--eval-freq")}
+    return {*takewhile(lambda word: not word.startswith("-"), after), *evaluations}
 
 
 @contextmanager

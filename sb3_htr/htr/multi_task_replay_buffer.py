@@ -1,6 +1,7 @@
 """Task-indexed replay with hindsight task relabelling at sample time."""
 
 import copy
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -17,6 +18,9 @@ from sb3_htr.common.type_aliases import Context, MultiTaskSamples, RewardLabels,
 from sb3_htr.htr.episode_store import EpisodeStore
 from sb3_htr.htr.relabel import RELABELLERS, Relabeller
 from sb3_htr.htr.transitions import Transitions
+
+# What a success may be worth without a warning: by measurement, 1 and 10 are learnt, 0.1 and 100 are not
+WORTH = 0.3, 30.0
 
 
 def spread(rng: np.random.Generator, ranges: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -68,7 +72,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
     :param task_family: the env's ``task_family``: reward hook and training tasks. Where it has no hook, as
         ``htr_envs.TaskDistribution`` has none, K must be 0
     :param max_episode_steps: time limit of the env
-    :param relabel_probability: K, in [0, 1]. K = 0 is plain PEARL, bit for bit. The default was chosen by measurement
+    :param relabel_probability: K, in [0, 1]. K = 0 draws what PEARL draws. The default was chosen by measurement
         (the paper sweeps .1 to 1 and does not name its best)
     :param relabeller: a :class:`Relabeller`, its name, or its name and settings,
         ``{"name": "EpisodeClustering", "cell_size": 0.2}``
@@ -143,6 +147,11 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         """
         sequence = np.random.SeedSequence(seed)
         self._rng, self.relabel_rng = (np.random.default_rng(child) for child in sequence.spawn(2))
+
+    @property
+    def _relabelled_by(self) -> str:
+        """Name of the relabeller, if it has experience of its own."""
+        return type(self.relabeller).__name__ if self.relabeller.keeps_experience and self.relabel_probability > 0 else ""
 
     @property
     def tells_rewards(self) -> bool:
@@ -257,6 +266,8 @@ class MultiTaskReplayBuffer(ReplayBuffer):
 
     def check_reward_hook(self, episodes: Sequence[tuple[int, np.ndarray]]) -> None:
         """
+        Warns of successes that are worth far less or more than the settings suit.
+
         :param episodes: training tasks and transitions (length, width) of some episodes
         :raises ValueError: if the reward hook disagrees with what the env gave for them, or a success is worth nothing
         """
@@ -283,13 +294,19 @@ class MultiTaskReplayBuffer(ReplayBuffer):
                 "not happen. Run htr_envs.check_task_env(env) to find out more."
             )
         reward = self.task_family.compute_reward(last, achieved)
-        worthless = task_reward(reward, last.task_free_reward)[:, 0] <= 0
-        if worthless.any():
-            i = int(worthless.argmax())
+        worth = task_reward(reward, last.task_free_reward)[:, 0]
+        if (worth <= 0).any():
+            i = int(worth.argmin())
             raise ValueError(
                 f"A step is worth {reward[i, 0]:g} under the task that it solves, and its task-free reward is "
                 f"{last.task_free_reward[i, 0]:g}, so that nothing tells the success: info['task_free_reward'] must be what a "
                 "step returns that solves nothing, which is -1 where rewards are -1 and 0."
+            )
+        if not WORTH[0] <= (typical := float(np.median(worth))) <= WORTH[1]:
+            warnings.warn(
+                f"A success is worth about {typical:.2g} here, and the settings suit 1 to 10: with 0.1 or 100, the Point Robot "
+                "is not learnt. Scale the rewards of the task family.",
+                stacklevel=2,
             )
 
     def discard_open_episodes(self) -> None:
@@ -310,6 +327,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         return {
             "episodes": self.episodes.state_dict(),
             "relabeller": self.relabeller.state_dict(),
+            "relabelled_by": self._relabelled_by,
             "task_family": family_facts(self.task_family),
             "random": [get_generator_state(generator) for generator in (self._rng, self.relabel_rng)],
         }
@@ -320,7 +338,13 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         :raises ValueError: if it is of another task family, or of a store of other sizes
         """
         check_same_family(state["task_family"], family_facts(self.task_family), "This model's env")
-        # First, as it may lack what another relabeller saved
+        own = self._relabelled_by
+        if own and (by := state.get("relabelled_by", own)) != own:
+            raise ValueError(
+                f"{own} keeps what it has relabelled, and what was saved is of {by or 'a relabeller that does not'}: make the "
+                "model with the relabeller that it was saved with."
+            )
+        # First, as what older versions saved may be another relabeller's
         self.relabeller.load_state_dict(state["relabeller"])
         self.episodes.load_state_dict(state["episodes"])
         for generator, saved in zip((self._rng, self.relabel_rng), state["random"], strict=True):
@@ -349,7 +373,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             raise ValueError("The replay buffer holds no complete episode of any task: collect some before sampling.")
         tasks = index.tasks[self._rng.integers(len(index.tasks), size=meta_batch_size)]
         context_source, batch_source = index.latest_episodes(tasks, self.context_episodes), index.all_episodes(tasks)
-        reward_task = self.task_family.train_tasks[tasks]
+        reward_task = self.task_family.train_tasks[tasks].astype(np.float32)
         relabelled = self.relabel_rng.random(meta_batch_size) < self.relabel_probability
         hindsight = self.relabeller.draw(tasks[relabelled]) if relabelled.any() else None
         if hindsight is not None:

@@ -17,16 +17,17 @@ MAX_TRANSITIONS = 24
 MIN_TIMESTEPS, N_EPISODES = 150_000, 3_000
 
 
-def settings_for(max_episode_steps: int, n_tasks_per_rollout: int) -> dict[str, Any]:
+def settings_for(max_episode_steps: int, n_tasks_per_rollout: int, n_episodes_per_task: int | None = None) -> dict[str, Any]:
     """
     What suits a family of tasks, as far as its time limit tells. For 20 and for 200 steps these are the settings that were
     found by measurement for the Point Robot, and chosen for the Wheeled robot.
 
     :param max_episode_steps: time limit
     :param n_tasks_per_rollout: training tasks per rollout
+    :param n_episodes_per_task: episodes on each of them, if that is given
     :return: discount, sizes of rollouts and updates; arguments of PEARL by their names
     """
-    n_episodes = min(max(STEPS_PER_TASK // max_episode_steps, 2), 10)
+    n_episodes = n_episodes_per_task or min(max(STEPS_PER_TASK // max_episode_steps, 2), 10)
     rollout = n_tasks_per_rollout * n_episodes * max_episode_steps
     n_transitions = min(max_episode_steps, MAX_TRANSITIONS)
     return {
@@ -48,14 +49,12 @@ def complete(given: dict[str, Any], max_episode_steps: int, n_tasks_per_rollout:
     :return: all of them
     :raises ValueError: for one that is out of its range
     """
-    infinity = float("inf")
-    settings = settings_for(max_episode_steps, n_tasks_per_rollout)
-    settings |= {name: value for name, value in given.items() if value is not None}
-    lowest = {"gamma": 0.0, "learning_starts": 0}
+    infinity, lowest = float("inf"), {"gamma": 0.0, "learning_starts": 0}
+    chosen = {name: value for name, value in given.items() if value is not None}
     check_numbers(
-        **{name: (value, lowest.get(name, 1), 1.0 if name == "gamma" else infinity) for name, value in settings.items()}
+        **{name: (value, lowest.get(name, 1), 1.0 if name == "gamma" else infinity) for name, value in chosen.items()}
     )
-    return settings
+    return settings_for(max_episode_steps, n_tasks_per_rollout, chosen.get("n_episodes_per_task")) | chosen
 
 
 def timesteps_for(max_episode_steps: int) -> int:

@@ -33,7 +33,7 @@ from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.callback import followed_by
 from sb3_htr.common.latent_policy import Obs, State
 from sb3_htr.common.progress import MetaProgressBarCallback
-from sb3_htr.common.random_state import get_generator_state, set_generator_state
+from sb3_htr.common.random_state import get_generator_state, seeded_actions, set_generator_state
 from sb3_htr.common.saving import AtomicSave, with_suffix
 from sb3_htr.common.training_state import Resumable
 from sb3_htr.common.vec_env import in_float32, make_task_vec_env
@@ -109,6 +109,9 @@ class OffPolicyMetaAlgorithm(AtomicSave, Resumable, SAC):
         }
         # Without an env, which is for files alone, the settings come from there
         max_episode_steps = 1 if env is None else checks.get_max_episode_steps(env)
+        if env is not None:
+            # All envs are stepped, as often as it takes
+            n_tasks_per_rollout = -(-n_tasks_per_rollout // env.num_envs) * env.num_envs
         settings = complete(given, max_episode_steps, n_tasks_per_rollout)
         super().__init__(
             policy=policy,
@@ -314,6 +317,8 @@ class OffPolicyMetaAlgorithm(AtomicSave, Resumable, SAC):
             self.task_bank.update()
             if replay_buffer.tells_rewards:
                 self.logger.record("rollout/train_tasks_reached", self.task_bank.n_train_solved)
+            # The updates that follow are those of this rollout: by its end, a schedule of the last one would be at its end too
+            self._update_current_progress_remaining(first_step, self._total_timesteps)
             callback.on_rollout_end()
             self._n_rollouts += 1
             if log_interval is not None and self._n_rollouts % log_interval == 0:
@@ -435,7 +440,7 @@ class OffPolicyMetaAlgorithm(AtomicSave, Resumable, SAC):
             The env keeps it. An env without task family takes none
         :param explorer: an explorer, its name, or its name and settings; the model's own by default
         :param deterministic: adapt with mean actions instead of samples
-        :param seed: seed of z
+        :param seed: seed of z, and of the actions if they are samples
         :return: an agent for this task, with the returns of its adaptation episodes, and whether each was a success: if the
             env does not say so (``info["is_success"]``), whether a reward was told from what is task-free
         :raises ValueError: for several envs, an env with other spaces, a task that the env does not have
@@ -463,10 +468,11 @@ class OffPolicyMetaAlgorithm(AtomicSave, Resumable, SAC):
             checks.check_tasks(vec_env, np.asarray(task, dtype=np.float32)[None])
         elif task is not None:
             checks.check_task_ids(vec_env, np.atleast_1d(task))
-        for step in adaptation_steps(vec_env, adaptation, n_episodes, self.policy.unscale_action, act, obs):
-            episode = adaptation.n_episodes[0] - step.dones[0]
-            returns[episode] += step.rewards[0]
-            successes[episode] |= step.infos[0].get("is_success", adaptation.task_reward[0] > 0)
+        with seeded_actions(seed, deterministic):
+            for step in adaptation_steps(vec_env, adaptation, n_episodes, self.policy.unscale_action, act, obs):
+                episode = adaptation.n_episodes[0] - step.dones[0]
+                returns[episode] += step.rewards[0]
+                successes[episode] |= step.infos[0].get("is_success", adaptation.task_reward[0] > 0)
         if adaptation.best_return[0] <= 0 and self.knowledge.tells_success:
             warnings.warn(
                 f"No reward was found in {n_episodes} episodes, so the agent is not adapted: allow more, or train longer.",

@@ -41,13 +41,15 @@ class PEARL(OffPolicyMetaAlgorithm):
     :param learning_rate: of all networks, may be a function of the remaining progress; falls from 1e-3 to 0 by default, for a
         stable end (paper: 3e-4)
     :param buffer_size: capacity in transitions, shared equally by the training tasks
-    :param learning_starts: env steps with random actions before learning starts, one rollout by default
+    :param learning_starts: env steps with random actions before learning starts; by default as many as a rollout has whose
+        episodes last to the time limit
     :param batch_size: transitions per task for actor and critics, fewer where fewer are at hand, an episode or 24 by default
         (PEARL's reference: 256)
     :param tau: soft update of the target critics, in (0, 1] (PEARL's reference: 0.005)
     :param gamma: discount, 1 - 2 / T for T steps of an episode by default, 0.98 at most (PEARL's reference for the sparse
         point robot: 0.9, which it is there)
-    :param gradient_steps: updates after each rollout, one for 20 env steps by default (PEARL's reference: 1000)
+    :param gradient_steps: updates after each rollout; by default one for 20 env steps of a rollout whose episodes last to the
+        time limit, and so more where they end early (PEARL's reference: 1000)
     :param replay_buffer_class: a MultiTaskReplayBuffer
     :param replay_buffer_kwargs: its arguments, among them ``relabel_probability`` (K of HTR; 0 is plain PEARL)
     :param ent_coef: entropy coefficient, ``"auto"`` learns it (0.01 is the reward scale 100 of PEARL's reference)
@@ -62,7 +64,8 @@ class PEARL(OffPolicyMetaAlgorithm):
         learns and leaves z alone. By measurement, on a two-link arm (one seed): .91 of the tasks are solved at 0, .99 and more
         at .5 and 2. It learns in each update: in one of four, at four times the weight, the Wheeled robot solves .90 of the
         validation tasks in place of all (one seed)
-    :param n_tasks_per_rollout: training tasks per rollout (PEARL's reference: 10)
+    :param n_tasks_per_rollout: training tasks per rollout, rounded up to a multiple of the envs, which all play
+        (PEARL's reference: 10)
     :param n_episodes_per_task: episodes on each of them; by default as many as make up 400 steps, from 2 to 10
     :param explorer: chooses z at meta-test: an :class:`sb3_htr.adaptation.Explorer`, its name, or its name and settings,
         ``{"name": "prior", "n_exploration_episodes": 9}``

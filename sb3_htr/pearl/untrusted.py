@@ -77,7 +77,9 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
         raise ValueError(f"{path} is damaged, or no model saved by PEARL: nothing of it was loaded{why}") from None
     if isinstance(env, str):
         env = make_task_vec_env(env)
-    _check_shapes(path, weights["policy"], env, {**settings["policy_kwargs"], **kwargs.get("policy_kwargs", {})})
+    for name in ("policy_kwargs", "replay_buffer_kwargs"):
+        kwargs[name] = {**settings.pop(name), **kwargs.get(name, {})}
+    _check_shapes(path, weights["policy"], env, kwargs["policy_kwargs"])
     model = PEARL("MlpPolicy", env, device=device, **{**settings, **kwargs})
     try:
         model.policy.load_state_dict(weights["policy"])

@@ -110,3 +110,22 @@ def test_agents_of_strangers_run_nothing_and_take_no_memory(tiny_pearl: MakePEAR
     assert not (tmp_path / "fuse").exists()
     with pytest.raises(FileNotFoundError):
         AdaptedAgent.load(tmp_path / "absent")
+
+
+def test_sampled_actions_of_an_adaptation_are_those_of_its_seed(tiny_pearl: MakePEARL) -> None:
+    """And training does not notice."""
+    model, env = tiny_pearl(), gym.make(ENV_ID)
+    state = th.get_rng_state()
+    actions: list[list[np.ndarray]] = []
+
+    class Watched(gym.Wrapper[Any, Any, Any, Any]):
+        def step(self, action: Any) -> Any:
+            actions[-1].append(action)
+            return self.env.step(action)
+
+    for seed in (0, 0, 1):
+        actions.append([])
+        model.adapt(Watched(env), n_episodes=2, task=0, deterministic=False, seed=seed)
+    np.testing.assert_array_equal(actions[0], actions[1])
+    assert (np.array(actions[0]) != np.array(actions[2])).any()
+    assert th.equal(state, th.get_rng_state())

@@ -124,6 +124,8 @@ def test_results_of_other_settings_are_not_taken_for_those_of_a_cell(tmp_path: P
     cell.result(tmp_path).unlink()
     with pytest.raises(ValueError, match=r"has the settings .*'--eval-episodes 2'.* needs .*'--eval-episodes 3'"):
         find_finished(replace(cell, n_episodes=3), cell.run_folder(tmp_path))
+    with pytest.raises(ValueError, match=r"'--eval-freq 480'.* needs .*'--eval-freq 240'"):
+        find_finished(replace(cell, eval_freq=240), cell.run_folder(tmp_path))
 
 
 def test_explorers_and_episodes_are_those_of_the_experiment(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Promises of the replay buffer, whatever relabels."""
 
+import copy
 import pickle
 from typing import Any
 
@@ -274,3 +275,11 @@ def test_a_reward_hook_that_returns_nan_is_refused() -> None:
     buffer.task_family = Broken()
     with pytest.raises(ValueError, match="compute_reward returned NaN or infinity"):
         buffer.sample(4)
+
+
+def test_hindsight_tasks_are_not_rounded_where_training_tasks_are_integers() -> None:
+    """As those of a family of one's own may be."""
+    buffer = filled(relabel_probability=1.0, relabeller=SingleEpisodeRelabelling(elsewhere=0.0))
+    buffer.task_family = copy.copy(buffer.task_family)
+    buffer.task_family.train_tasks = np.round(buffer.task_family.train_tasks).astype(int)
+    assert not buffer.sample(20, meta_batch_size=50, context_size=20).unrewarded.any()

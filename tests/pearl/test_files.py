@@ -21,7 +21,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3.common.utils import LinearSchedule
 
-from helpers import ENV_ID, ROLLOUT, MakePEARL, many
+from helpers import ENV_ID, ROLLOUT, MakePEARL, many, parameters
 from helpers.bombs import Bomb, bombs
 from sb3_htr import PEARL, AdaptedAgent, evaluate_adaptation, load_untrusted
 from sb3_htr.adaptation import Aggregate, Belief, Prior
@@ -187,6 +187,13 @@ def test_a_replay_buffer_of_other_settings_is_refused(tiny_pearl: MakePEARL, tmp
     with pytest.raises(ValueError, match="make the model with the relabeller that it was saved with"):
         (model := tiny_pearl(replay_buffer_kwargs={"relabeller": "EpisodeClustering"})).load_replay_buffer(tmp_path / "buffer")
     assert model.replay_buffer is not None and model.replay_buffer.size() == 0, "nothing was loaded"
+    # Refused whatever it holds: hindsight buffers of another kind, or none at K = 0
+    kinds: list[dict[str, Any]] = [{"relabeller": "HindsightForesight"}, {"relabel_probability": 0.0}]
+    for kind in kinds:
+        tiny_pearl(replay_buffer_kwargs=kind).learn(ROLLOUT).save_replay_buffer(tmp_path / "other")
+        with pytest.raises(ValueError, match="make the model with the relabeller that it was saved with"):
+            model.load_replay_buffer(tmp_path / "other")
+    model.learn(ROLLOUT)
     with pytest.raises(ValueError, match="use the settings that they were saved with"):
         tiny_pearl(buffer_size=10_000).load_replay_buffer(tmp_path / "buffer")
     with pytest.raises(ValueError, match=r"task bank has 20 steps of 9 numbers .* this model has 7 of 9"):
@@ -218,3 +225,26 @@ def test_a_save_that_fails_leaves_the_old_model(tiny_pearl: MakePEARL, tmp_path:
     with pytest.raises(TypeError):
         model.save(tmp_path / "model")
     assert (tmp_path / "model.zip").read_bytes() == before and len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_state_is_a_copy(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl(ent_coef="auto").learn(ROLLOUT)
+    before, state = parameters(model), model.state_dict()
+    entropy = state["log_ent_coef"].clone()
+    model.learn(ROLLOUT, reset_num_timesteps=False)
+    assert not th.equal(entropy, model.log_ent_coef), "it learns"  # type: ignore[arg-type]
+    model.load_state_dict(state)
+    after = parameters(model)
+    assert all(th.equal(value, after[name]) for name, value in before.items())
+    assert th.equal(entropy, model.log_ent_coef)  # type: ignore[arg-type]
+
+
+def test_settings_of_an_untrusted_file_are_joined_with_those_given(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    tiny_pearl(replay_buffer_kwargs={"relabel_probability": 0.3}).save(tmp_path / "model")
+    given: dict[str, Any] = {
+        "policy_kwargs": {"normalize_observations": True},
+        "replay_buffer_kwargs": {"context_episodes": 2},
+    }
+    model = load_untrusted(tmp_path / "model", ENV_ID, **given)
+    assert model.policy.latent_dim == 3 and model.replay_buffer is not None
+    assert (model.replay_buffer.relabel_probability, model.replay_buffer.context_episodes) == (0.3, 2)

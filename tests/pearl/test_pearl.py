@@ -291,7 +291,27 @@ def test_schedules_end_where_they_should(tiny_pearl: MakePEARL) -> None:
     model = tiny_pearl(learning_rate=LinearSchedule(1e-3, 0.0, 1.0))
     model.learn(int(1.5 * ROLLOUT))
     assert model.num_timesteps == 2 * ROLLOUT
-    assert model.actor.optimizer.param_groups[0]["lr"] == 0
+    # Of the updates of the last rollout, which are those of its beginning
+    assert model.actor.optimizer.param_groups[0]["lr"] == pytest.approx(1e-3 / 3)
+
+
+@pytest.mark.parametrize("n_rollouts", [1, 2])
+def test_every_rollout_is_learnt_from(n_rollouts: int) -> None:
+    """With the default learning rate, which falls to 0, however short the training is."""
+    settings = {key: value for key, value in TINY.items() if key != "learning_starts"}
+    model = PEARL("MlpPolicy", ENV_ID, **settings)
+    for _ in range(n_rollouts):
+        before = parameters(model)
+        model.learn(ROLLOUT, reset_num_timesteps=False)
+        assert all(not th.equal(value, before[name]) for name, value in parameters(model).items() if "actor" in name)
+
+
+def test_a_rollout_is_of_as_many_tasks_as_its_envs_play(tiny_pearl: MakePEARL) -> None:
+    settings = {"n_tasks_per_rollout": 4, "n_episodes_per_task": 2, "gradient_steps": None, "learning_starts": None}
+    model = tiny_pearl(make_task_vec_env(ENV_ID, 3), **settings)
+    assert model.n_tasks_per_rollout == 6
+    model.learn(1)
+    assert model.num_timesteps == 6 * 2 * 20 == 20 * model._n_updates
 
 
 # --- prediction

@@ -1,7 +1,7 @@
 """How experience gets another task."""
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 import torch as th
@@ -64,6 +64,8 @@ class Relabeller(ABC):
     buffer: "MultiTaskReplayBuffer"
     #: Networks, for strategies that ask for values of tasks
     policy: AdaptingPolicy
+    #: Whether it has experience of its own, which is saved with the buffer's
+    keeps_experience: ClassVar[bool] = False
 
     def bind(self, buffer: "MultiTaskReplayBuffer") -> None:
         """

@@ -20,6 +20,7 @@ class HindsightBuffers(Relabeller):
 
     #: With the hindsight buffers in place of tasks
     episodes: EpisodeStore
+    keeps_experience = True
 
     def bind(self, buffer: "MultiTaskReplayBuffer") -> None:
         super().bind(buffer)
