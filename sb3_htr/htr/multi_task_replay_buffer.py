@@ -304,8 +304,8 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             )
         if not WORTH[0] <= (typical := float(np.median(worth))) <= WORTH[1]:
             warnings.warn(
-                f"A success is worth about {typical:.2g} here, and the settings suit 1 to 10: with 0.1 or 100, the Point Robot "
-                "is not learnt. Scale the rewards of the task family.",
+                f"A success is worth about {typical:.2g} here, and the settings suit 1 to 10: with 0.1 or 100, the "
+                "Point Robot is not learnt. Scale the rewards of the task family.",
                 stacklevel=2,
             )
 
