@@ -48,20 +48,20 @@ class HindsightTaskStrategy(Enum):
         return (rng.random(lengths.shape) * lengths).astype(np.int64)
 
     @staticmethod
-    def choose(count: np.ndarray, rng: np.random.Generator, is_solved: np.ndarray | None = None) -> np.ndarray:
+    def choose(count: np.ndarray, rng: np.random.Generator, demerits: np.ndarray | None = None) -> np.ndarray:
         """
         Choose among candidates with probabilities inverse to how common they are.
 
         :param count: (n, n_candidates), how often something like the candidate was seen, more than 0
         :param rng: source of randomness
-        :param is_solved: (n, n_candidates) bool, candidates that are chosen only where all of the row are
+        :param demerits: (n, n_candidates), candidates that have more than others of their row are not chosen
         :return: (n,) int, index of the chosen candidate in each row
         """
         if count.shape[1] == 1:
             return np.zeros(len(count), dtype=np.int64)
         weight = 1 / count
-        if is_solved is not None:
-            weight = np.where(is_solved & ~is_solved.all(axis=1, keepdims=True), 0.0, weight)
+        if demerits is not None:
+            weight = np.where(demerits > demerits.min(axis=1, keepdims=True), 0.0, weight)
         cumulative = np.cumsum(weight, axis=1)
         return (rng.random((len(count), 1)) * cumulative[:, -1:] > cumulative).sum(axis=1)
 

@@ -11,7 +11,9 @@ from sb3_htr.htr.relabel.hindsight_task import HindsightTaskStrategy, solved_at_
 
 # Rows that candidates for hindsight tasks are compared with: enough to tell common from rare, in linear time
 MAX_COMPARED = 64
-# Times that candidates are drawn anew, from episodes of all tasks, where the start solves all of them
+# Training tasks, drawn anew each time, that candidates are compared with
+MAX_TRAIN_TASKS = 128
+# Times that candidates are drawn anew, from episodes of all tasks, where none of them will do
 MAX_REDRAWS = 7
 
 
@@ -22,13 +24,14 @@ class Candidates(NamedTuple):
     :param episode: (n, n_candidates) int
     :param step: (n, n_candidates) int, virtual row of one of its steps
     :param task: (n, n_candidates, task_dim) float32, what this step reached
-    :param is_solved: (n, n_candidates) bool, whether the start of the episode solves that, where this is asked
+    :param demerits: (n, n_candidates) int, where these are asked: 2 if the start of the episode solves that, 1 if this step solves
+        no training task
     """
 
     episode: np.ndarray
     step: np.ndarray
     task: np.ndarray
-    is_solved: np.ndarray
+    demerits: np.ndarray
 
 
 class SingleEpisodeRelabelling(Relabeller):
@@ -49,6 +52,10 @@ class SingleEpisodeRelabelling(Relabeller):
         are, and as many others from episodes of all tasks, drawn seven times. An object that nobody touched is where it was,
         and ``"even"`` does not see it where objects begin elsewhere in each episode. Of one candidate (``"random"``,
         ``"final"``) there is nothing to prefer
+    :param like_training: share of the rows for which one of the candidates that are left is chosen whose step solves some
+        training task, and others are drawn in the same way as long as there is none, once such are within reach. What was
+        reached is not what will be asked for: objects fall off the table, and ``"even"`` draws what is rare. The other rows
+        keep what is learnt as wide as what is reached
     :raises ValueError: for an unknown strategy or source, or a share out of [0, 1]
     """
 
@@ -58,8 +65,9 @@ class SingleEpisodeRelabelling(Relabeller):
         rl_batch_source: str = "episode",
         elsewhere: float = 0.25,
         prefer_unsolved: bool = True,
+        like_training: float = 0.5,
     ) -> None:
-        check_numbers(elsewhere=(elsewhere, 0.0, 1.0))
+        check_numbers(elsewhere=(elsewhere, 0.0, 1.0), like_training=(like_training, 0.0, 1.0))
         check_flags(prefer_unsolved=prefer_unsolved)
         self.elsewhere = elsewhere
         self.hindsight_task_strategy = HindsightTaskStrategy.of(hindsight_task_strategy)
@@ -67,27 +75,41 @@ class SingleEpisodeRelabelling(Relabeller):
             raise ValueError(f'rl_batch_source is {rl_batch_source!r}, expected "episode" or "task".')
         self.rl_batch_source = rl_batch_source
         self.prefer_unsolved = prefer_unsolved
+        self.like_training = like_training
 
     def draw(self, tasks: np.ndarray) -> HindsightDraw:
         buffer, strategy, index = self.buffer, self.hindsight_task_strategy, self.buffer.episodes.index()
-        candidates = self._candidates(index.task_episode[tasks], index.task_episode[tasks + 1])
+        like_training = self._like_training(len(tasks))
+        candidates = self._candidates(index.task_episode[tasks], index.task_episode[tasks + 1], like_training)
+        if not (candidates.demerits[like_training] % 2 == 0).any():
+            # Training tasks are not within reach yet
+            like_training[:] = False
+            candidates.demerits[:] -= candidates.demerits % 2
         for _ in range(MAX_REDRAWS):
-            again = np.flatnonzero(candidates.is_solved.all(axis=1))
+            again = np.flatnonzero(candidates.demerits.min(axis=1) > 0)
             if len(again) == 0:
                 break
             anywhere = np.zeros_like(again), np.full_like(again, len(index.episode_row) - 1)
-            for values, others in zip(candidates, self._candidates(*anywhere), strict=True):
-                values[again] = others
-        episode, step, hindsight_task, is_solved = candidates
+            others = self._candidates(*anywhere, like_training[again])
+            better = others.demerits.min(axis=1) < candidates.demerits[again].min(axis=1)
+            for values, drawn in zip(candidates, others, strict=True):
+                values[again[better]] = drawn[better]
+        episode, step, hindsight_task, demerits = candidates
         count = self._count_alike(self._steps(step[:MAX_COMPARED, 0]), hindsight_task)
-        chosen = np.arange(len(tasks)), strategy.choose(count, buffer.relabel_rng, is_solved)
+        chosen = np.arange(len(tasks)), strategy.choose(count, buffer.relabel_rng, demerits)
         episode = episode[chosen]
         batch = context = np.stack([index.episode_row[episode], index.episode_row[episode + 1]], axis=1)
         if self.rl_batch_source == "task":
             batch = index.all_episodes(np.searchsorted(index.task_episode, episode, side="right") - 1)
         return HindsightDraw(buffer.episodes, context, batch, hindsight_task[chosen], False, self.elsewhere)
 
-    def _candidates(self, first: np.ndarray, end: np.ndarray) -> Candidates:
+    def _like_training(self, n: int) -> np.ndarray:
+        """(n,) bool, for which rows a hindsight task like those of training is looked for."""
+        if self.hindsight_task_strategy.n_candidates == 1 or self.like_training == 0:
+            return np.zeros(n, dtype=bool)
+        return self.buffer.relabel_rng.random(n) < self.like_training
+
+    def _candidates(self, first: np.ndarray, end: np.ndarray, like_training: np.ndarray) -> Candidates:
         """Of each range of episodes (n,), some episodes and one step of each."""
         rng, index, strategy = self.buffer.relabel_rng, self.buffer.episodes.index(), self.hindsight_task_strategy
         n = len(first), strategy.n_candidates
@@ -95,10 +117,13 @@ class SingleEpisodeRelabelling(Relabeller):
         start, end = index.episode_row[episode], index.episode_row[episode + 1]
         step = start + strategy.steps(end - start, rng)
         family = self.buffer.task_family
-        task, is_solved = family.hindsight_task(self._steps(step), 0), np.zeros(n, dtype=bool)
+        task, demerits = family.hindsight_task(self._steps(step), 0), np.zeros(n, dtype=np.int64)
         if self.prefer_unsolved and strategy.n_candidates > 1:
-            is_solved = solved_at_start(family, self._steps(start), task)
-        return Candidates(episode, step, task, is_solved)
+            demerits += 2 * solved_at_start(family, self._steps(start), task)
+        if like_training.any():
+            train = family.train_tasks[rng.permutation(len(family.train_tasks))[:MAX_TRAIN_TASKS]]
+            demerits[like_training] += ~family.is_success(self._steps(step[like_training, :, None]), train).any(axis=(2, 3))
+        return Candidates(episode, step, task, demerits)
 
     def _steps(self, virtual: np.ndarray) -> Trajectory:
         """(..., 1, dim), each virtual row as a trajectory of its own."""
