@@ -24,8 +24,8 @@ class Candidates(NamedTuple):
     :param episode: (n, n_candidates) int
     :param step: (n, n_candidates) int, virtual row of one of its steps
     :param task: (n, n_candidates, task_dim) float32, what this step reached
-    :param demerits: (n, n_candidates) int, where these are asked: 2 if the start of the episode solves that, 1 if this step solves
-        no training task
+    :param demerits: (n, n_candidates) int, where these are asked: 2 if the start of the episode solves that, 1 if this step
+        solves no training task
     """
 
     episode: np.ndarray
