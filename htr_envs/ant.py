@@ -111,7 +111,6 @@ def _ants(
     goal_radius: float = 0.4,
     **family_kwargs: Any,
 ) -> tuple[LocomotionFamily, AntDynamics]:
-    # the first two by position alone: a single env has no argument n_threads, and so refuses it
     family = LocomotionFamily(goal_radius=goal_radius, **family_kwargs)
     return family, AntDynamics(num_envs, n_threads, ctrl_cost_weight, contact_cost_weight, healthy_reward, reset_noise_scale)
 
@@ -243,8 +242,10 @@ class AntEnv(DynamicsEnv):
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 20}  # type: ignore[misc]
 
-    def __init__(self, reward_type: str = "sparse", render_mode: str | None = None, **kwargs: Any) -> None:
-        super().__init__(*_ants(1, 1, **kwargs), reward_type, render_mode)
+    def __init__(
+        self, reward_type: str = "sparse", render_mode: str | None = None, n_threads: int | None = None, **kwargs: Any
+    ) -> None:
+        super().__init__(*_ants(1, n_threads, **kwargs), reward_type, render_mode)
 
 
 class AntVectorEnv(MujocoVectorEnv):

@@ -180,7 +180,9 @@ class HiddenGoalEnv(TaskEnv):
         self.observation_space = spaces.Box(-np.inf, np.inf, first.shape, np.float32)
         low, high = (bound.astype(np.float32) for bound in (env.action_space.low, env.action_space.high))
         self.action_space = spaces.Box(low, high, dtype=np.float32)
-        self.metadata = {**self.metadata, "render_fps": env.metadata.get("render_fps", 25)}  # type: ignore[misc]
+        modes = [mode for mode in self.metadata["render_modes"] if mode in env.metadata.get("render_modes", ())]
+        shown = {"render_modes": modes, "render_fps": env.metadata.get("render_fps", 25)}
+        self.metadata = {**self.metadata, **shown}  # type: ignore[misc]
         self.render_mode = render_mode
         # An episode is its seed and its actions: with them, a copy plays it again, as simulations can rarely be copied
         self._seed, self._actions = 0, list[NDArray[Any]]()
@@ -230,7 +232,7 @@ class HiddenGoalEnv(TaskEnv):
             return None
         goal = self.task
         if self._picture is None:
-            open_no_window()
+            open_no_window("rgb_array")
             self._picture, self._n_shown = self.task_family.source.make(render_mode=self.render_mode), NOT_BEGUN
         self._follow(self._picture, self._n_shown)
         self._n_shown = len(self._actions)

@@ -132,7 +132,7 @@ class MujocoDynamics(Dynamics[PositionGoalFamily]):
             # imported here: who never renders needs no OpenGL
             from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 
-            open_no_window()
+            open_no_window(render_mode)
             self.model.geom("goal").size[0] = task_family.goal_radius
             data = mujoco.MjData(self.model)  # of its own: a picture changes nothing in the simulation
             self._renderer = MujocoRenderer(self.model, data, dict(CAMERA), FRAME_WIDTH, FRAME_HEIGHT, camera_id=-1), data

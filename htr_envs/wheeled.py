@@ -66,7 +66,6 @@ def _wheeled(
     reset_noise_scale: float = 0.01,
     **family_kwargs: Any,
 ) -> tuple[LocomotionFamily, WheeledDynamics]:
-    # the first two by position alone: a single env has no argument n_threads, and so refuses it
     return LocomotionFamily(**family_kwargs), WheeledDynamics(num_envs, n_threads, ctrl_cost_weight, reset_noise_scale)
 
 
@@ -186,8 +185,10 @@ class WheeledEnv(DynamicsEnv):
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 100}  # type: ignore[misc]
 
-    def __init__(self, reward_type: str = "sparse", render_mode: str | None = None, **kwargs: Any) -> None:
-        super().__init__(*_wheeled(1, 1, **kwargs), reward_type, render_mode)
+    def __init__(
+        self, reward_type: str = "sparse", render_mode: str | None = None, n_threads: int | None = None, **kwargs: Any
+    ) -> None:
+        super().__init__(*_wheeled(1, n_threads, **kwargs), reward_type, render_mode)
 
 
 class WheeledVectorEnv(MujocoVectorEnv):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.error import DependencyNotInstalled
+from gymnasium.wrappers import FlattenObservation, FrameStackObservation, RescaleObservation, TransformObservation
 from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
@@ -18,6 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 from helpers import ENV_ID, ROLLOUT, MakePEARL, many
 from htr_envs import PointRobotEnv, PointRobotFamily, PointRobotVectorEnv, check_task_env
 from sb3_htr import PEARL, evaluate_adaptation, load_untrusted
+from sb3_htr.adaptation import Step
 from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
 from sb3_htr.rivals.rl2 import RL2
@@ -481,3 +483,35 @@ def test_rewards_of_another_scale_are_warned_of(factor: float, tiny_pearl: MakeP
     about = [str(warning.message) for warning in caught if "A success is worth" in str(warning.message)]
     assert bool(about) == (factor != 1)
     assert factor == 1 or f"about {factor:.2g} here" in about[0]
+
+
+def test_an_episode_without_end_is_noticed(tiny_pearl: MakePEARL) -> None:
+    class Endless(gym.Env[Any, Any]):
+        observation_space, action_space = gym.make(ENV_ID).observation_space, gym.make(ENV_ID).action_space
+
+        def reset(self, **kwargs: Any) -> Any:
+            return np.zeros(2, dtype=np.float32), {}
+
+        def step(self, action: Any) -> Any:
+            return np.zeros(2, dtype=np.float32), 0.0, False, False, {}
+
+    with pytest.raises(ValueError, match=r"An episode goes on after 200 steps, 10 times what those of training had"):
+        tiny_pearl().adapt(Endless(), n_episodes=1)
+
+
+def test_actions_in_the_units_of_the_env_are_no_evidence(tiny_pearl: MakePEARL) -> None:
+    adaptation = tiny_pearl().start_adaptation(1)
+    obs = np.zeros((1, 2), dtype=np.float32)
+    with pytest.raises(ValueError, match=r"The actions are up to 50, expected them scaled to \[-1, 1\]"):
+        adaptation.observe(Step(obs, np.full((1, 2), 50.0), np.zeros(1), obs, np.array([False]), [{}]))
+
+
+BOUNDED = spaces.Box(-5, 5, (2,), np.float32)
+
+
+@pytest.mark.parametrize("wrap", [lambda env: RescaleObservation(env, -1, 1), lambda env: FrameStackObservation(env, 2)])
+def test_a_wrapper_that_changes_observations_is_refused_in_the_first_rollout(wrap: Any, tiny_pearl: MakePEARL) -> None:
+    """Rewards do not tell: nearly all are 0, with and without it."""
+    env = FlattenObservation(wrap(TransformObservation(gym.make(ENV_ID), lambda obs: obs, BOUNDED)))
+    with pytest.raises(ValueError, match="a wrapper changes observations, and hindsight rewards would be wrong"):
+        tiny_pearl(env, n_tasks_per_rollout=1).learn(1)

@@ -23,7 +23,7 @@ class MetaEvalCallback(EvalCallback):
     The score is the mean return of the last adaptation episode over the tasks. ``best_model.zip`` is chosen by it, on
     validation tasks by default, so that the test tasks stay unseen until the end. ``evaluations.npz`` has ``timesteps``
     (n,), ``results`` (n, n_tasks), the returns of the last episode, and ``returns`` and ``successes``
-    (n, n_tasks, n_eval_episodes).
+    (n, n_tasks, n_eval_episodes). A training that ends before its first evaluation is evaluated at its end.
 
     :param eval_env: env of the task family
     :param tasks: ``"validation"``, ``"test"`` or task vectors (n_tasks, task_dim)
@@ -80,8 +80,15 @@ class MetaEvalCallback(EvalCallback):
             self.callback_on_new_best.init_callback(self.model)
 
     def _on_step(self) -> bool:
-        if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
-            return True
+        return self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0 or self._evaluate()
+
+    def _on_training_end(self) -> None:
+        # Of a training that is shorter than the time between two evaluations, and was not interrupted
+        if self.eval_freq > 0 and not self.returns and self.num_timesteps >= self.model._total_timesteps:
+            self._evaluate()
+
+    def _evaluate(self) -> bool:
+        """Whether training goes on."""
         record = record_adaptation(
             cast(MetaLearner, self.model),
             self.eval_env,

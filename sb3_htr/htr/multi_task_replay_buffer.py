@@ -222,7 +222,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         :param done: (n_envs,)
         :param infos: one dict per env with ``task_id`` and ``task_free_reward``
         :raises ValueError: NaN or infinite values, a task id that is no training task, a task that changed within an episode,
-            an episode longer than the time limit
+            an episode longer than the time limit, another achieved task than the family tells
         """
         task = np.array([info.get("task_id", -1) for info in infos], dtype=np.int64)
         timeout = np.array([info.get("TimeLimit.truncated", False) for info in infos])
@@ -252,10 +252,24 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         self._open_length = step + 1
         for ended in np.flatnonzero(done):
             episode = self._open[ended, : self._open_length[ended]]
+            self._check_achieved(episode[-1:], infos[ended], int(ended))
             self.episodes.add(int(task[ended]), episode)
             for listener in self.episode_listeners:
                 listener(int(task[ended]), episode)
             self._open_length[ended] = 0
+
+    def _check_achieved(self, last: np.ndarray, info: dict[str, Any], env: int) -> None:
+        """The env names what its last step achieved, by what it sees itself."""
+        if "achieved_task" not in info or not self.tells_rewards:
+            return
+        achieved = self.task_family.hindsight_task(self.transitions.trajectory(last), 0)
+        if not np.allclose(achieved, info["achieved_task"], rtol=1e-3, atol=1e-4):
+            told = info["achieved_task"]
+            raise ValueError(
+                f"A step of env {env} achieved {told}, by its info, and {achieved} by hindsight_task of what arrives here: "
+                "a wrapper changes observations, and hindsight rewards would be wrong. Make what it does a part of the task "
+                "family and its env."
+            )
 
     def _raise_not_finite(self, rows: np.ndarray, task: np.ndarray) -> None:
         i = int((~np.isfinite(rows)).any(axis=1).argmax())

@@ -41,6 +41,9 @@ from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.pearl.horizon import complete, timesteps_for
 from sb3_htr.pearl.policies import PEARLPolicy
 
+# An adaptation gives up after an episode of so many times those of training: an env that never ends one would hang
+ENDLESS = 10
+
 SelfMetaAlgorithm = TypeVar("SelfMetaAlgorithm", bound="OffPolicyMetaAlgorithm")
 
 
@@ -443,7 +446,7 @@ class OffPolicyMetaAlgorithm(AtomicSave, Resumable, SAC):
         :param seed: seed of z, and of the actions if they are samples
         :return: an agent for this task, with the returns of its adaptation episodes, and whether each was a success: if the
             env does not say so (``info["is_success"]``), whether a reward was told from what is task-free
-        :raises ValueError: for several envs, an env with other spaces, a task that the env does not have
+        :raises ValueError: for several envs, an env with other spaces, a task that the env does not have, episodes without end
         """
         checks.check_numbers(n_episodes=(n_episodes, 1, float("inf")))
         vec_env = self._wrap_env(make_task_vec_env(env) if isinstance(env, str) else env, monitor_wrapper=False)
@@ -463,6 +466,9 @@ class OffPolicyMetaAlgorithm(AtomicSave, Resumable, SAC):
         adaptation = self.start_adaptation(1, explorer, th.Generator().manual_seed(seed))
         returns, successes = np.zeros(n_episodes), np.zeros(n_episodes, dtype=bool)
         act = partial(adaptation.act, deterministic=deterministic)
+        # Known unless the model was loaded without an env
+        longest = np.inf if self.replay_buffer is None else ENDLESS * self.replay_buffer.max_episode_steps
+        length = 0
         obs = vec_env.reset()
         if task is not None and np.ndim(task) > 0:
             checks.check_tasks(vec_env, np.asarray(task, dtype=np.float32)[None])
@@ -471,6 +477,12 @@ class OffPolicyMetaAlgorithm(AtomicSave, Resumable, SAC):
         with seeded_actions(seed, deterministic):
             for step in adaptation_steps(vec_env, adaptation, n_episodes, self.policy.unscale_action, act, obs):
                 episode = adaptation.n_episodes[0] - step.dones[0]
+                length = 0 if step.dones[0] else length + 1
+                if length > longest:
+                    raise ValueError(
+                        f"An episode goes on after {longest} steps, {ENDLESS} times what those of training had: the env must "
+                        "end its episodes, as in a gymnasium.wrappers.TimeLimit."
+                    )
                 returns[episode] += step.rewards[0]
                 successes[episode] |= step.infos[0].get("is_success", adaptation.task_reward[0] > 0)
         if adaptation.best_return[0] <= 0 and self.knowledge.tells_success:

@@ -30,6 +30,20 @@ def test_meta_eval_logs_keeps_the_best_and_writes_npz(tiny_pearl: MakePEARL, tmp
     assert model.num_timesteps == 3 * ROLLOUT
 
 
+def test_a_training_shorter_than_the_time_between_evaluations_is_evaluated_at_its_end(
+    tiny_pearl: MakePEARL, tmp_path: Path
+) -> None:
+    """Once, after its last update."""
+    callback = MetaEvalCallback(
+        make_task_vec_env(ENV_ID, 20), eval_freq=10_000, log_path=str(tmp_path), best_model_save_path=str(tmp_path), verbose=0
+    )
+    model = tiny_pearl().learn(ROLLOUT, callback=callback)
+    assert np.load(tmp_path / "evaluations.npz")["timesteps"].tolist() == [ROLLOUT]
+    assert PEARL.load(tmp_path / "best_model")._n_updates == model._n_updates > 0
+    callback.on_training_end()
+    assert len(callback.returns) == 1
+
+
 def test_meta_eval_is_on_validation_tasks_unless_told(tmp_path: Path) -> None:
     env, family = make_task_vec_env(ENV_ID, 2), PointRobotFamily()
     assert (MetaEvalCallback(env).tasks == family.validation_tasks).all()

@@ -235,10 +235,17 @@ def test_dynamics_that_do_not_fit_are_refused() -> None:
         DynamicsEnv(LineFamily(), Walkers(1), render_mode="rgb_array")
 
 
-def test_threads_are_no_argument_of_a_single_env() -> None:
+def test_threads_make_no_difference_to_a_single_env() -> None:
+    """Agents that were trained on a batch are watched, exported and adapted in one."""
     for env_id in NOISY_STARTS:
-        with pytest.raises(TypeError, match="n_threads"):
-            gym.make(env_id, n_threads=2)
+        steps = []
+        for n_threads in (None, 2):
+            env = gym.make(env_id, n_threads=n_threads)
+            env.reset(seed=0)
+            steps.append(env.step(np.full(env.action_space.shape or (), 0.5, dtype=np.float32))[0])
+        np.testing.assert_array_equal(*steps)
+        with pytest.raises(ValueError, match="n_threads is 0"):
+            gym.make(env_id, n_threads=0)
 
 
 # ---------------------------------------------------------------- the rules on tasks

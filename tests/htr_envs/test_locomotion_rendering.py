@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.error import DependencyNotInstalled
 from gymnasium.utils.env_checker import data_equivalence
 
 from helpers.drawing import skip_where_mujoco_cannot_draw
@@ -92,6 +93,11 @@ def test_a_window_shows_the_reset_and_each_step(env_id: str, monkeypatch: pytest
 
     monkeypatch.setattr("gymnasium.envs.mujoco.mujoco_rendering.MujocoRenderer", Window)
     env, base = make(env_id, render_mode="human")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(DependencyNotInstalled, match="needs a screen, and there is none: take 'rgb_array'"):
+        env.reset()
+    monkeypatch.setenv("DISPLAY", ":0")
     env.reset(seed=0, options={"task": [0.5, 1.0]})
     env.step(env.action_space.sample())
     env.close()

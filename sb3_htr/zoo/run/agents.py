@@ -270,8 +270,9 @@ def agent_for(
     wanted = f"{env_id}" + (f" run {exp_id}" if exp_id else "") + (f" by {method}" if method else "")
     if exp_id and numbers:
         raise FileNotFoundError(f"There is no trained agent for {wanted} in {folder}/, only runs {', '.join(numbers)}.")
+    given = f" --method {method}" if method else ""
     with_agent = sorted(f"{file.stem} ({file.parent.name})" for file in shipped("trained_agents").glob("*/*.zip"))
     raise FileNotFoundError(
-        f"There is no trained agent for {wanted} in {folder}/: train one with `sb3-htr train --env {env_id} -f {folder}`. "
-        f"The package comes with {', '.join(with_agent) or 'none'}."
+        f"There is no trained agent for {wanted} in {folder}/: train one with "
+        f"`sb3-htr train --env {env_id}{given} -f {folder}`. The package comes with {', '.join(with_agent) or 'none'}."
     )

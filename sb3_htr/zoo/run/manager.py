@@ -200,8 +200,7 @@ class MetaExperimentManager(ExperimentManager):
         super().create_log_folder()
 
     def create_callbacks(self) -> None:
-        """Add the log of training, ``progress.csv``; a run shorter than ``--eval-freq`` is evaluated at its end."""
-        self.eval_freq = min(self.eval_freq, self.n_timesteps)
+        """Add the log of training, ``progress.csv``."""
         super().create_callbacks()
         self.callbacks.append(ProgressCallback(Path(self.save_path) / "progress.csv"))
         self._checkpointing = next((call for call in self.callbacks if isinstance(call, CheckpointCallback)), None)

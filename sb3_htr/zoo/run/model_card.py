@@ -118,8 +118,10 @@ def model_card(record: dict[str, Any], scores: dict[str, AdaptationRecord], repo
     )
     data = ModelCardData(library_name="stable-baselines3", tags=[env_id, *TAGS], model_name=name, eval_results=[result])
     kwargs = "".join(f", {key}={value!r}" for key, value in record["env_kwargs"].items())
-    imports = "".join(f"import {package}  # registers the env\n" for package in record["gym_packages"] or ["htr_envs"])
-    if env_id.startswith("HiddenGoal/") and not record["gym_packages"]:
+    is_hidden = env_id.startswith("HiddenGoal/")
+    packages = [*(record["gym_packages"] or []), *(["htr_envs"] if is_hidden or not record["gym_packages"] else [])]
+    imports = "".join(f"import {package}  # registers the env\n" for package in packages)
+    if is_hidden:
         imports += f'htr_envs.hide_goal("{env_id.partition("/")[2]}")  # registers the family\n'
     # A method of another version says no more than its name
     method = methods().get(name)
