@@ -509,7 +509,9 @@ def test_actions_in_the_units_of_the_env_are_no_evidence(tiny_pearl: MakePEARL) 
 BOUNDED = spaces.Box(-5, 5, (2,), np.float32)
 
 
-@pytest.mark.parametrize("wrap", [lambda env: RescaleObservation(env, -1, 1), lambda env: FrameStackObservation(env, 2)])
+@pytest.mark.parametrize(
+    "wrap", [lambda env: RescaleObservation(env, np.float32(-1), np.float32(1)), lambda env: FrameStackObservation(env, 2)]
+)
 def test_a_wrapper_that_changes_observations_is_refused_in_the_first_rollout(wrap: Any, tiny_pearl: MakePEARL) -> None:
     """Rewards do not tell: nearly all are 0, with and without it."""
     env = FlattenObservation(wrap(TransformObservation(gym.make(ENV_ID), lambda obs: obs, BOUNDED)))

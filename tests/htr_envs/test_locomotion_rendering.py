@@ -92,12 +92,12 @@ def test_a_window_shows_the_reset_and_each_step(env_id: str, monkeypatch: pytest
             shown.append("closed")
 
     monkeypatch.setattr("gymnasium.envs.mujoco.mujoco_rendering.MujocoRenderer", Window)
-    env, base = make(env_id, render_mode="human")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(DependencyNotInstalled, match="needs a screen, and there is none: take 'rgb_array'"):
-        env.reset()
+        make(env_id, render_mode="human")[0].reset()
     monkeypatch.setenv("DISPLAY", ":0")
+    env, base = make(env_id, render_mode="human")
     env.reset(seed=0, options={"task": [0.5, 1.0]})
     env.step(env.action_space.sample())
     env.close()
