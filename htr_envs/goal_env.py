@@ -232,7 +232,7 @@ class HiddenGoalEnv(TaskEnv):
             return None
         goal = self.task
         if self._picture is None:
-            open_no_window("rgb_array")
+            open_no_window()
             self._picture, self._n_shown = self.task_family.source.make(render_mode=self.render_mode), NOT_BEGUN
         self._follow(self._picture, self._n_shown)
         self._n_shown = len(self._actions)

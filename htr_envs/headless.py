@@ -14,7 +14,7 @@ def has_screen() -> bool:
     return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def open_no_window(render_mode: str) -> None:
+def open_no_window(render_mode: str = "rgb_array") -> None:
     """Have MuJoCo draw without a window where there is no screen; gymnasium would try to open one, which ends the process.
 
     :param render_mode: of the env.

@@ -8,7 +8,7 @@ import torch as th
 from sb3_htr.adaptation.explorers import Explorer
 from sb3_htr.adaptation.knowledge import LatentKnowledge
 from sb3_htr.adaptation.policy import ContextualPolicy
-from sb3_htr.common.task_reward import ROUNDING, task_reward
+from sb3_htr.common.task_reward import task_reward
 from sb3_htr.common.type_aliases import Context
 from sb3_htr.htr.episode_store import evenly_spread
 
@@ -111,18 +111,13 @@ class Adaptation:
     def observe(self, step: Step) -> None:
         """
         :param step: what each env did
-        :raises ValueError: for arrays of other shapes, NaN and infinity, and actions that are not scaled
+        :raises ValueError: for arrays of other shapes, NaN and infinity
         """
         if not self.is_training:  # what is collected is checked where it is stored
             self._check("observations", step.observations, 2)
             self._check("rewards", step.rewards, 1)
             self._check("next_observations", step.next_observations, 2)
             self._check("actions", step.actions, 2)
-            if np.abs(step.actions).max(initial=0) > 1 + ROUNDING:
-                raise ValueError(
-                    f"The actions are up to {np.abs(step.actions).max():g}, expected them scaled to [-1, 1], as act() gives "
-                    "them: model.policy.scale_action does that."
-                )
         self._remember(step.observations, step.actions, step.rewards)
         self.task_reward = self._told(step) if self.is_training else self._learned(step)
         self.episode_return += self.task_reward

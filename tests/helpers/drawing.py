@@ -12,7 +12,7 @@ def _obstacle() -> str:
     import mujoco
     from gymnasium.envs.mujoco.mujoco_rendering import OffScreenViewer
 
-    open_no_window("rgb_array")
+    open_no_window()
     model = mujoco.MjModel.from_xml_string('<mujoco><worldbody><body><freejoint/><geom size="1"/></body></worldbody></mujoco>')
     try:
         OffScreenViewer(model, mujoco.MjData(model), 16, 16).close()
