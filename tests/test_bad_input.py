@@ -75,7 +75,7 @@ def test_envs(tiny_pearl: MakePEARL, make_env: Callable[[], Any], message: str) 
 
 
 def test_an_unknown_id_is_gymnasiums_business(tiny_pearl: MakePEARL) -> None:
-    with pytest.raises(gym.error.NameNotFound, match="SparsePointRobot"):
+    with pytest.raises(gym.error.NameNotFound, match=r"Did you mean: `SparsePointRobot`\?.*Import the package"):
         tiny_pearl("SparsePointRobo-v0")
 
 

@@ -26,6 +26,7 @@ from sb3_htr.common.resume import checkpoints
 from sb3_htr.zoo.cli import console, main
 from sb3_htr.zoo.commands.optimize import create_study
 from sb3_htr.zoo.run.agents import RECORD, agent_at
+from sb3_htr.zoo.run.trust import check_arguments, plain_settings
 
 
 @pytest.fixture
@@ -99,6 +100,18 @@ def test_an_env_within_the_env_of_a_record(fuse: Path, tmp_path: Path, tiny_pear
     for command in (["enjoy", str(run), "--no-render"], ["evaluate", str(run)], ["export", str(run)]):
         with pytest.raises(ValueError, match="has 'evil:Env-v0' among its settings, which can run any code"):
             main(command)
+    assert not fuse.exists()
+
+
+def test_an_env_within_the_env_of_settings_is_fine_once_the_user_names_its_module(fuse: Path) -> None:
+    settings = {"env_kwargs": {"env_id": "evil:Env-v0"}}
+    arguments = ["--env-kwargs", "env_id:'evil:Env-v0'"]
+    assert plain_settings(settings, "my.yml", False, ["evil"]) == settings
+    check_arguments(arguments, [], "run.json", False, ["evil"])
+    with pytest.raises(ValueError, match=r"my\.yml has 'evil:Env-v0' among its settings"):
+        plain_settings(settings, "my.yml", False, ["good"])
+    with pytest.raises(ValueError, match=r"run\.json has 'evil:Env-v0' among its settings"):
+        check_arguments(arguments, [], "run.json", False)
     assert not fuse.exists()
 
 

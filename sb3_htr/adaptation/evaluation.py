@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.loop import Adapts, Watched, adaptation_steps
 from sb3_htr.common.checks import (
-    check_is_no_gymnasium_vector_env,
+    check_is_env,
     check_numbers,
     check_tasks,
     get_max_episode_steps,
@@ -144,11 +144,11 @@ def record_adaptation(
     :param seed: seed of env, z and sampled actions
     :return: returns, successes and achieved tasks
     """
-    check_is_no_gymnasium_vector_env(env)
     n_tasks = 20 if tasks is None else len(tasks)
     if isinstance(env, str):
         env = make_task_vec_env(env, max(n_tasks, 1), seed)
-    elif isinstance(env, gym.Env):
+    check_is_env(env)
+    if isinstance(env, gym.Env):
         env = BaseAlgorithm._wrap_env(env, monitor_wrapper=False)
     model.check_env(env)
     tasks = get_task_family(env).test_tasks if tasks is None else np.asarray(tasks, dtype=np.float32)

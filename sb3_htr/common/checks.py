@@ -23,11 +23,13 @@ TASK_ENV_ADVICE = "derive the env from htr_envs.TaskEnv and test it with htr_env
 VARIADIC = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
 
 
-def check_is_no_gymnasium_vector_env(env: Any) -> None:
+def check_is_env(env: Any) -> None:
     """
     :param env: that a user gave
     :raises ValueError: if SB3 cannot use it, for which SB3 has a sentence about another library
     """
+    if isinstance(env, str):
+        raise ValueError(f"The env is the id {env!r}, expected an env: make it with sb3_htr.make_task_vec_env(id, n_envs).")
     if isinstance(env, gym.vector.VectorEnv):
         raise ValueError(
             "The env is a gymnasium VectorEnv, expected one of Stable-Baselines3: pass the env's id, or make it with "

@@ -1,13 +1,16 @@
-"""Models whose files are never half written."""
+"""Models whose files are never half written, and loaded as what they are."""
 
 import io
 import pathlib
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, TypeVar
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.checks import check_keywords, keywords_of
+
+SelfCheckedFiles = TypeVar("SelfCheckedFiles", bound="CheckedFiles")
 
 
 def with_suffix(path: Any, suffix: str) -> pathlib.Path:
@@ -20,8 +23,32 @@ def with_suffix(path: Any, suffix: str) -> pathlib.Path:
     return path if path.suffix else path.with_suffix(suffix)
 
 
-class AtomicSave(BaseAlgorithm):
-    """A Stable-Baselines3 algorithm whose ``save`` is atomic."""
+class CheckedFiles(BaseAlgorithm):
+    """An algorithm whose ``save`` is atomic, and whose ``load`` takes neither files of others nor settings that it lacks."""
+
+    @classmethod
+    def load(cls: type[SelfCheckedFiles], path: Any, env: Any = None, *args: Any, **kwargs: Any) -> SelfCheckedFiles:
+        """
+        :param path: file of :meth:`save`
+        :param env: to train on, or None to predict, adapt and evaluate
+        :param args: further ones of Stable-Baselines3's ``load``, of which ``device`` comes next
+        :param kwargs: these by name, and settings in place of those of the file
+        :return: the model
+        :raises ValueError: for an unknown setting, or a file of another algorithm
+        """
+        check_keywords(cls.__name__, kwargs, cls, also=keywords_of(BaseAlgorithm.load))
+        return super().load(path, env, *args, **kwargs)
+
+    def _setup_model(self) -> None:
+        self._check_policy_class()
+        super()._setup_model()  # type: ignore[safe-super]
+
+    def _check_policy_class(self) -> None:
+        if not issubclass(self.policy_class, (*self.policy_aliases.values(),)):
+            raise ValueError(
+                f"{type(self).__name__} has no policies such as {self.policy_class.__name__}: is the file one of another "
+                f"algorithm? Expected one of {[*self.policy_aliases]}, or a subclass of theirs."
+            )
 
     def save(
         self,

@@ -202,12 +202,16 @@ def make_task_vec_env(
     :param vec_env_class: of single envs; by default they are natively batched if they can be, else in this process
     :return: a monitored VecEnv
     :raises ValueError: for an env without tasks, or no envs
+    :raises gymnasium.error.NameNotFound: for an id that is not registered
     """
     check_numbers(n_envs=(n_envs, 1, float("inf")))
     module, _, env_id = env_id.rpartition(":")
     if module:
         importlib.import_module(module)
-    spec, env_kwargs = gym.spec(env_id), env_kwargs or {}
+    try:
+        spec, env_kwargs = gym.spec(env_id), env_kwargs or {}
+    except (gym.error.NameNotFound, gym.error.NamespaceNotFound) as error:
+        raise type(error)(f"{error} Import the package that registers it before, as in `import htr_envs`.") from None
     venv: VecEnv
     if spec.vector_entry_point is None or wrapper is not None or vec_env_class is not None:
 

@@ -34,7 +34,7 @@ from sb3_htr.common.callback import followed_by
 from sb3_htr.common.latent_policy import Obs, State
 from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.random_state import get_generator_state, seeded_actions, set_generator_state
-from sb3_htr.common.saving import AtomicSave, with_suffix
+from sb3_htr.common.saving import CheckedFiles, with_suffix
 from sb3_htr.common.training_state import Resumable
 from sb3_htr.common.vec_env import in_float32, make_task_vec_env
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
@@ -47,7 +47,7 @@ ENDLESS = 10
 SelfMetaAlgorithm = TypeVar("SelfMetaAlgorithm", bound="OffPolicyMetaAlgorithm")
 
 
-class OffPolicyMetaAlgorithm(AtomicSave, Resumable, SAC):
+class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
     """
     SAC whose rollouts are adaptations to training tasks and whose replay is ordered by task. A subclass adds ``train``.
 
@@ -202,7 +202,7 @@ class OffPolicyMetaAlgorithm(AtomicSave, Resumable, SAC):
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        checks.check_is_no_gymnasium_vector_env(env)
+        checks.check_is_env(env)
         return in_float32(SAC._wrap_env(env, verbose, monitor_wrapper))
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:

@@ -16,7 +16,7 @@ from sb3_htr.adaptation.adaptation import Step
 from sb3_htr.adaptation.loop import Watched
 from sb3_htr.common.callback import followed_by
 from sb3_htr.common.checks import check_has_env, check_is_not_normalized
-from sb3_htr.common.saving import AtomicSave
+from sb3_htr.common.saving import CheckedFiles
 from sb3_htr.common.training_state import Resumable
 
 
@@ -99,7 +99,7 @@ class FreshStart(BaseCallback):
         return True
 
 
-class Rival(AtomicSave, Resumable):
+class Rival(CheckedFiles, Resumable):
     """
     A mixin for algorithms of Stable-Baselines3. It is made as :class:`sb3_htr.PEARL` is: of a policy and an env of a task
     family. What the algorithm needs around the env is put there by its ``_wrap_env``.

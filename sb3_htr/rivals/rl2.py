@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.adaptation import Step
 from sb3_htr.adaptation.loop import Watched
-from sb3_htr.common.checks import check_is_no_gymnasium_vector_env, check_numbers
+from sb3_htr.common.checks import check_is_env, check_numbers
 from sb3_htr.common.vec_env import in_float32, make_task_vec_env
 from sb3_htr.rivals.base import Rival, RivalAdaptation
 from sb3_htr.rivals.trial_policy import TrialLstmPolicy
@@ -123,7 +123,7 @@ class RL2(Rival, RecurrentPPO):
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         if isinstance(env, TrialVecEnv):
             return env
-        check_is_no_gymnasium_vector_env(env)
+        check_is_env(env)
         return TrialVecEnv(in_float32(RecurrentPPO._wrap_env(env, verbose, monitor_wrapper)), N_EPISODES_PER_TRIAL)
 
     def _setup_model(self) -> None:

@@ -8,15 +8,16 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, GymEnv, RolloutReturn, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 from stable_baselines3.sac import SAC
-from stable_baselines3.sac.policies import SACPolicy
+from stable_baselines3.sac.policies import MultiInputPolicy, SACPolicy
 
 from sb3_htr.adaptation.loop import Watched
 from sb3_htr.common.checks import (
-    check_is_no_gymnasium_vector_env,
+    check_is_env,
     check_numbers,
     check_same_family,
     family_facts,
@@ -110,6 +111,7 @@ class SACHER(Rival, SAC):
     """
 
     DEFAULT_POLICY: ClassVar[str] = "MultiInputPolicy"
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": MultiInputPolicy}
     ACTS_WITH: ClassVar[dict[str, Any]] = {"buffer_size": 1}
 
     def __init__(
@@ -140,10 +142,11 @@ class SACHER(Rival, SAC):
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         if isinstance(env, ShownTaskVecEnv):
             return env
-        check_is_no_gymnasium_vector_env(env)
+        check_is_env(env)
         return ShownTaskVecEnv(in_float32(SAC._wrap_env(env, verbose, monitor_wrapper)))
 
     def _setup_model(self) -> None:
+        self._check_policy_class()
         if self.env is None:
             # Loaded for prediction only: SB3 wants a buffer, we want no memory of it
             self.replay_buffer = DictReplayBuffer(1, self.observation_space, self.action_space)  # type: ignore[arg-type]

@@ -19,6 +19,7 @@ import pytest
 import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
+from stable_baselines3 import SAC
 from stable_baselines3.common.utils import LinearSchedule
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL, many, parameters
@@ -29,6 +30,8 @@ from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr import EpisodeClustering
 from sb3_htr.pearl.pearl import LEARNING_RATE
 from sb3_htr.pearl.untrusted import NUMBERS, WORDS
+from sb3_htr.rivals.rl2 import RL2
+from sb3_htr.rivals.sac_her import SACHER
 
 
 def repack(source: Path, target: Path, changed: dict[str, bytes]) -> None:
@@ -248,3 +251,18 @@ def test_settings_of_an_untrusted_file_are_joined_with_those_given(tiny_pearl: M
     model = load_untrusted(tmp_path / "model", ENV_ID, **given)
     assert model.policy.latent_dim == 3 and model.replay_buffer is not None
     assert (model.replay_buffer.relabel_probability, model.replay_buffer.context_episodes) == (0.3, 2)
+
+
+def test_a_file_is_loaded_as_what_it_is_and_with_settings_that_are_known(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    tiny_pearl().save(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"PEARL has no setting 'gama': did you mean gamma\?"):
+        PEARL.load(tmp_path / "model", gama=0.9)
+    assert PEARL.load(tmp_path / "model", gamma=0.9, device="cpu").gamma == 0.9
+    SAC("MlpPolicy", "Pendulum-v1").save(tmp_path / "sac")
+    with pytest.raises(ValueError, match="PEARL has no policies such as SACPolicy: is the file one of another algorithm"):
+        PEARL.load(tmp_path / "sac")
+    for rival in (RL2, SACHER):
+        with pytest.raises(ValueError, match=f"{rival.__name__} has no policies such as PEARLPolicy"):
+            rival.load(tmp_path / "model")
+    with pytest.raises(ValueError, match=f"The env is the id '{ENV_ID}', expected an env: make it with"):
+        PEARL.load(tmp_path / "model", env=ENV_ID)

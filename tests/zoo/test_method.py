@@ -145,6 +145,16 @@ def test_what_is_not_known_is_refused_in_one_sentence(arguments: list[str], mess
     assert "\n" not in str(refusal.value) and not list(tmp_path.rglob("*.zip"))
 
 
+@pytest.mark.parametrize(("missing", "given"), [("policy", []), ("n_timesteps", []), ("policy", ["-n", "240"])])
+def test_a_file_that_lacks_what_a_training_needs(missing: str, given: list[str], tmp_path: Path) -> None:
+    block = {"policy": "MlpPolicy", "n_timesteps": 240, "n_envs": 4}
+    del block[missing]
+    (tmp_path / "my.yml").write_text(yaml.safe_dump({ENV_ID: block}))
+    with pytest.raises(ValueError, match=rf"my\.yml has no {missing} for {ENV_ID}: add it"):
+        main(["train", "--env", ENV_ID, "-f", str(tmp_path / "logs"), "-conf", str(tmp_path / "my.yml"), *given])
+    assert not (tmp_path / "logs").exists()
+
+
 # --- one name all the way
 
 

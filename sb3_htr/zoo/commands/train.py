@@ -81,7 +81,7 @@ def main(argv: Sequence[str]) -> None:
             print(f"{run} is finished, after {done:,} env steps. To train further: sb3-htr train --resume {run} -n STEPS")
             return
         given = [*given_arguments(record["arguments"]), "--seed", str(record["seed"]), "-n", str(planned)]
-        check_arguments(given, record["gym_packages"], run / RECORD, args.trust)
+        check_arguments(given, record["gym_packages"], run / RECORD, args.trust, args.gym_packages)
         import_packages(args.gym_packages, record["gym_packages"], run / RECORD, args.trust)
         args.method = record["method"]
         algorithm = get_method(args.method).algorithm

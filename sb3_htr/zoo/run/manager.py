@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import shlex
 import shutil
 import signal
 import sys
@@ -45,7 +46,7 @@ from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback, ProgressCallback
 from sb3_htr.zoo.run.folder import claim, lock
 from sb3_htr.zoo.run.method import DEFAULT, PEARLMethod, get_method, merged, names_of
 from sb3_htr.zoo.run.search_space import convert_pearl_params, sample_pearl_params
-from sb3_htr.zoo.run.trust import plain_settings, refuse
+from sb3_htr.zoo.run.trust import PACKAGES, plain_settings, refuse
 
 # What a YAML file may have beside the arguments of the algorithm
 ZOO_SETTINGS = ("n_envs", "n_timesteps", "env_wrapper", "vec_env_wrapper", "callback", "env_kwargs")
@@ -93,11 +94,18 @@ class MetaExperimentManager(ExperimentManager):
             raise ValueError(f"{self.method.name} is trained by another algorithm: choose it by --method {self.method.name}.")
         if self.optimize_hyperparameters and not isinstance(self.method, PEARLMethod):
             raise ValueError(f"The search is for settings of PEARL, and {self.method.name} has none: choose another --method.")
-        hyperparams = self.method.settings(plain_settings(hyperparams, self.config, self.trust))
+        checked = partial(plain_settings, trust=self.trust, named=self.args.gym_packages)
+        hyperparams = self.method.settings(checked(hyperparams, self.config))
         if self.resumed is not None:  # what a user gave comes from a file now
-            given = plain_settings(given, self.resumed / RECORD, self.trust)
+            given = checked(given, self.resumed / RECORD)
         self._given = names_of(given)
-        hyperparams = merged(merged(hyperparams, plain_settings(self._trial(trial_id), self.storage, self.trust)), given)
+        hyperparams = merged(merged(hyperparams, checked(self._trial(trial_id), self.storage)), given)
+        if self.n_timesteps > 0:
+            hyperparams["n_timesteps"] = self.n_timesteps
+        if missing := sorted({"policy", "n_timesteps"} - hyperparams.keys()):
+            raise ValueError(
+                f"{self.config} has no {' and no '.join(missing)} for {self.env_name}: add it, as pearl.yml has it."
+            )
         saved = OrderedDict(sorted(hyperparams.items()))
         print(f"Method {self.method.name}: {self.config} has the settings of the env. With those of the command line:")
         pprint(dict(saved))
@@ -231,10 +239,15 @@ class MetaExperimentManager(ExperimentManager):
             finally:
                 stopping = self._checkpointing is not None and self._checkpointing.stopping
                 if checkpoints(Path(self.save_path)) and (stopping or model.num_timesteps < self.n_timesteps):
-                    print(f"To go on: sb3-htr train --resume {self.save_path}")
+                    print(f"To go on: {self._to_go_on()}")
                 assert model.env is not None
                 model.env.close()
                 self._lock.release()
+
+    def _to_go_on(self) -> str:
+        packages = [name for name in self.args.gym_packages if name not in PACKAGES]
+        named = ["--gym-packages", *packages] if packages else []
+        return shlex.join(["sb3-htr", "train", "--resume", self.save_path, *named, *["--trust"] * self.trust])
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
         if self.trust:
@@ -259,7 +272,7 @@ class MetaExperimentManager(ExperimentManager):
         try:
             super().save_trained_model(model)
         except WRITE_ERRORS as error:
-            again = f"`sb3-htr train --resume {self.save_path}` goes on from the last checkpoint"
+            again = f"`{self._to_go_on()}` goes on from the last checkpoint"
             if not checkpoints(Path(self.save_path)):
                 again = "train again, as there is no checkpoint either"
             raise OSError(

@@ -39,11 +39,12 @@ def refuse(file: object, what: str) -> ValueError:
     return ValueError(f"{file} {what}, which can run any code: add --trust if you know where the file comes from.")
 
 
-def plain_settings(hyperparams: dict[str, Any], file: object, trust: bool) -> dict[str, Any]:
+def plain_settings(hyperparams: dict[str, Any], file: object, trust: bool, named: Iterable[str] = ()) -> dict[str, Any]:
     """
     :param hyperparams: of a YAML file
     :param file: for messages
     :param trust: whether it may have code run
+    :param named: modules that the user has named
     :return: the same, with strings that rl_zoo3 would evaluate replaced by the values that they spell
     :raises ValueError: if code would be run
     """
@@ -53,7 +54,7 @@ def plain_settings(hyperparams: dict[str, Any], file: object, trust: bool) -> di
     for key in IMPORTED:
         if hyperparams.get(key) is not None:
             raise refuse(file, f"has {key}: {hyperparams[key]!r}")
-    check_env_kwargs(hyperparams.get("env_kwargs"), file, trust)
+    check_env_kwargs(hyperparams.get("env_kwargs"), file, trust, named)
     if "." in str(hyperparams.get("policy", "")):
         raise refuse(file, f"has policy: {hyperparams['policy']!r}")
     for key in EVALUATED:
@@ -64,12 +65,15 @@ def plain_settings(hyperparams: dict[str, Any], file: object, trust: bool) -> di
     return hyperparams
 
 
-def check_arguments(arguments: Sequence[str], packages: Sequence[str], file: object, trust: bool) -> None:
+def check_arguments(
+    arguments: Sequence[str], packages: Sequence[str], file: object, trust: bool, named: Iterable[str] = ()
+) -> None:
     """
     :param arguments: of a training, from the record of a run
     :param packages: modules that the record asks for, see :func:`import_packages`
     :param file: the record, for messages
     :param trust: whether it may have code run
+    :param named: modules that the user has named
     :raises ValueError: if code would be run
     """
     option = ""
@@ -81,7 +85,7 @@ def check_arguments(arguments: Sequence[str], packages: Sequence[str], file: obj
             key, _, value = word.partition(":")
             refused = not _is_literal(value)
             if not refused:
-                check_env_kwargs({key: ast.literal_eval(value)}, file, trust)
+                check_env_kwargs({key: ast.literal_eval(value)}, file, trust, named)
         else:
             refused = (option in CONF and Path(word).suffix not in (".yml", ".yaml")) or (
                 option == "--gym-packages" and word not in packages
