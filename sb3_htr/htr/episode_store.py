@@ -67,6 +67,11 @@ class EpisodeStore:
     :param row_dim: number of columns of a transition
     """
 
+    #: How often something was written
+    n_written: int
+    #: (n_slots,) int, which of these times is that of the episode in a slot
+    written: np.ndarray
+
     def __init__(self, n_tasks: int, episodes_per_task: int, episode_length: int, row_dim: int) -> None:
         self.episodes_per_task = episodes_per_task
         self.episode_length = episode_length
@@ -74,6 +79,8 @@ class EpisodeStore:
         self._slots = np.full((n_tasks, episodes_per_task), -1, dtype=np.int64)
         self._n_slots = 0
         self._lengths = np.zeros(0, dtype=np.int64)
+        self.n_written = 0
+        self.written = np.zeros(0, dtype=np.int64)
         self._data = np.zeros((0, episode_length, row_dim), dtype=np.float32)
         self._index: EpisodeIndex | None = None
 
@@ -112,6 +119,8 @@ class EpisodeStore:
             slot = self._slots[task, position] = self._allocate()
         self._data[slot, : len(episode)] = episode
         self._lengths[slot] = len(episode)
+        self.n_written += 1
+        self.written[slot] = self.n_written
         self.n_added[task] += 1
         self._index = None
 
@@ -154,6 +163,8 @@ class EpisodeStore:
         free = int(arrays["capacity"]) - self._n_slots
         self._lengths = np.pad(arrays["lengths"], (0, free))
         self._data = np.pad(arrays["data"], ((0, free), (0, 0), (0, 0)))
+        self.n_written += 1
+        self.written = np.full(len(self._data), self.n_written)
         self._index = None
 
     def _allocate(self) -> int:
@@ -163,6 +174,7 @@ class EpisodeStore:
             data[: self._n_slots] = self._data
             self._data = data
             self._lengths = np.append(self._lengths, np.zeros(n_slots - len(self._lengths), dtype=np.int64))
+            self.written = np.append(self.written, np.zeros(n_slots - len(self.written), dtype=np.int64))
         self._n_slots += 1
         return self._n_slots - 1
 

@@ -1,6 +1,6 @@
 """Single Episode Relabelling (SER): relabelling when experience is drawn."""
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -8,11 +8,15 @@ from sb3_htr.common.checks import check_flags, check_numbers
 from sb3_htr.common.type_aliases import Trajectory
 from sb3_htr.htr.relabel.base import HindsightDraw, Relabeller
 from sb3_htr.htr.relabel.hindsight_task import HindsightTaskStrategy, solved_at_start
+from sb3_htr.htr.step_memo import StepMemo
+
+if TYPE_CHECKING:
+    from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 
 # Rows that candidates for hindsight tasks are compared with: enough to tell common from rare, in linear time
 MAX_COMPARED = 64
-# Training tasks, drawn anew each time, that candidates are compared with
-MAX_TRAIN_TASKS = 128
+# Training tasks, evenly spread in their list, that a step is compared with
+MAX_TRAIN_TASKS = 1024
 # Times that candidates are drawn anew, from episodes of all tasks, where none of them will do
 MAX_REDRAWS = 7
 
@@ -77,6 +81,10 @@ class SingleEpisodeRelabelling(Relabeller):
         self.prefer_unsolved = prefer_unsolved
         self.like_training = like_training
 
+    def bind(self, buffer: "MultiTaskReplayBuffer") -> None:
+        super().bind(buffer)
+        self._demerits = StepMemo(self._ask_demerits)
+
     def draw(self, tasks: np.ndarray) -> HindsightDraw:
         buffer, strategy, index = self.buffer, self.hindsight_task_strategy, self.buffer.episodes.index()
         like_training = self._like_training(len(tasks))
@@ -84,7 +92,7 @@ class SingleEpisodeRelabelling(Relabeller):
         if not (candidates.demerits[like_training] % 2 == 0).any():
             # Training tasks are not within reach yet
             like_training[:] = False
-            candidates.demerits[:] -= candidates.demerits % 2
+            candidates.demerits[:] &= ~1
         for _ in range(MAX_REDRAWS):
             again = np.flatnonzero(candidates.demerits.min(axis=1) > 0)
             if len(again) == 0:
@@ -95,7 +103,7 @@ class SingleEpisodeRelabelling(Relabeller):
             for values, drawn in zip(candidates, others, strict=True):
                 values[again[better]] = drawn[better]
         episode, step, hindsight_task, demerits = candidates
-        count = self._count_alike(self._steps(step[:MAX_COMPARED, 0]), hindsight_task)
+        count = self._count_alike(self._steps(step[:MAX_COMPARED, 0]), hindsight_task, demerits)
         chosen = np.arange(len(tasks)), strategy.choose(count, buffer.relabel_rng, demerits)
         episode = episode[chosen]
         batch = context = np.stack([index.episode_row[episode], index.episode_row[episode + 1]], axis=1)
@@ -116,25 +124,43 @@ class SingleEpisodeRelabelling(Relabeller):
         episode = first[:, None] + (rng.random(n) * (end - first)[:, None]).astype(np.int64)
         start, end = index.episode_row[episode], index.episode_row[episode + 1]
         step = start + strategy.steps(end - start, rng)
-        family = self.buffer.task_family
-        task, demerits = family.hindsight_task(self._steps(step), 0), np.zeros(n, dtype=np.int64)
-        if self.prefer_unsolved and strategy.n_candidates > 1:
-            demerits += 2 * solved_at_start(family, self._steps(start), task)
-        if like_training.any():
-            train = family.train_tasks[rng.permutation(len(family.train_tasks))[:MAX_TRAIN_TASKS]]
-            demerits[like_training] += ~family.is_success(self._steps(step[like_training, :, None]), train).any(axis=(2, 3))
+        task = self.buffer.task_family.hindsight_task(self._steps(step), 0)
+        if strategy.n_candidates == 1:
+            return Candidates(episode, step, task, np.zeros(n, dtype=np.int8))
+        demerits = self._demerits.look_up(self.buffer.episodes, index.rows[step])
+        demerits[~like_training] &= ~1
         return Candidates(episode, step, task, demerits)
+
+    def _ask_demerits(self, rows: np.ndarray) -> np.ndarray:
+        """(n,) int, of steps in these rows of the store, see :class:`Candidates`."""
+        buffer, family = self.buffer, self.buffer.task_family
+        demerits = np.zeros(len(rows), dtype=np.int8)
+        step = buffer.transitions.trajectory(buffer.episodes.rows[rows, None])
+        if self.prefer_unsolved:
+            start = buffer.transitions.trajectory(buffer.episodes.rows[rows - rows % buffer.episodes.episode_length, None])
+            demerits += 2 * solved_at_start(family, start, family.hindsight_task(step, 0))
+        if self.like_training > 0:
+            n_train = len(family.train_tasks)
+            train = family.train_tasks[np.linspace(0, n_train - 1, min(n_train, MAX_TRAIN_TASKS)).astype(np.int64)]
+            each = Trajectory(*(values[:, None] for values in step))
+            demerits += ~family.is_success(each, train).any(axis=(1, 2))
+        return demerits
 
     def _steps(self, virtual: np.ndarray) -> Trajectory:
         """(..., 1, dim), each virtual row as a trajectory of its own."""
         episodes = self.buffer.episodes
         return self.buffer.transitions.trajectory(episodes.rows[episodes.index().rows[virtual]][..., None, :])
 
-    def _count_alike(self, first: Trajectory, task: np.ndarray) -> np.ndarray:
-        """(n, n_candidates), how many of some other rows solve each candidate's task with their first candidate, plus 1."""
-        if task.shape[1] == 1:
-            return np.ones(task.shape[:2])
-        alike = self.buffer.task_family.is_success(first, task[:, :, None])[..., 0]
-        own = np.arange(alike.shape[-1])
-        alike[own, 0, own] = False
-        return 1 + alike.sum(axis=-1)
+    def _count_alike(self, first: Trajectory, task: np.ndarray, demerits: np.ndarray) -> np.ndarray:
+        """
+        (n, n_candidates), how many of some other rows solve each candidate's task with their first candidate, plus 1; where
+        others of the row have fewer demerits, 1.
+        """
+        count = np.ones(task.shape[:2])
+        if task.shape[1] > 1:
+            row, column = np.nonzero(demerits == demerits.min(axis=1, keepdims=True))
+            alike = self.buffer.task_family.is_success(first, task[row, column, None])[..., 0]
+            own = np.flatnonzero((column == 0) & (row < alike.shape[1]))
+            alike[own, row[own]] = False
+            count[row, column] += alike.sum(axis=1)
+        return count
