@@ -273,6 +273,9 @@ def _take_window_back(env: Any) -> None:
 def hide_goal(env_id: str, **env_kwargs: Any) -> str:
     """Register the task family of a GoalEnv, with the time limit of the GoalEnv.
 
+    A later call for the same GoalEnv, with other arguments, takes the place of this one: the id does not name them. For
+    variants side by side, register ids of your own for the GoalEnv.
+
     :param env_id: id of the GoalEnv; ``"module:id"`` imports the module that registers it.
     :param env_kwargs: arguments of the GoalEnv.
     :return: id of the family, ``HiddenGoal/`` and that of the GoalEnv (``/`` in it becomes ``-``).

@@ -58,6 +58,7 @@ class WithoutHook(gym.Wrapper[Any, Any, Any, Any]):
         (lambda: WithSpaces(gym.make(ENV_ID), action_space=spaces.Discrete(3)), "The action space is Discrete"),
         (lambda: gym.make(ENV_ID, reward_type="dense"), "reward_type is not 'sparse'.*rl_reward_type"),
         (lambda: PointRobotEnv(), "The env has no time limit"),
+        (lambda: BatchedTaskVecEnv(PointRobotVectorEnv(2, max_episode_steps=None)), "The env has no time limit"),
         (
             lambda: gym.make_vec(ENV_ID, 2),
             "is a gymnasium VectorEnv, expected one of Stable-Baselines3: pass the env's id",

@@ -174,8 +174,8 @@ def get_max_episode_steps(env: VecEnv) -> int:
     """
     # gymnasium's TimeLimit, or an env that counts the steps itself, as a batched one does
     for name in ("_max_episode_steps", "max_episode_steps"):
-        if env.has_attr(name):
-            return int(env.get_attr(name)[0])
+        if env.has_attr(name) and (limit := env.get_attr(name)[0]) is not None:
+            return int(limit)
     spec = env.get_attr("spec")[0] if env.has_attr("spec") else None
     if spec is None or spec.max_episode_steps is None:
         raise ValueError(

@@ -147,6 +147,12 @@ class CheckpointCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         if self._pending is not None:
+            at = self._pending["model"]["counters"]["num_timesteps"]
+            if self.num_timesteps != at:
+                raise ValueError(
+                    f"The training begins at {self.num_timesteps} env steps, and its checkpoint is of {at}: call "
+                    "learn(remaining steps, reset_num_timesteps=False)."
+                )
             for name in LOGGER_STATE:
                 getattr(self.logger, name).update(self._pending["logger"][name])
             for output, folder in zip(self._tensorboards(), self._pending["tensorboard_folders"], strict=True):

@@ -37,6 +37,8 @@ class CheckedFiles(BaseAlgorithm):
         :raises ValueError: for an unknown setting, or a file of another algorithm
         """
         check_keywords(cls.__name__, kwargs, cls, also=keywords_of(BaseAlgorithm.load))
+        if "stats_window_size" in kwargs:  # has another name in SB3's models
+            kwargs["_stats_window_size"] = kwargs.pop("stats_window_size")
         return super().load(path, env, *args, **kwargs)
 
     def _setup_model(self) -> None:

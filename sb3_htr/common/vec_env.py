@@ -85,11 +85,16 @@ class BatchedTaskVecEnv(VecEnv):
         return hasattr(self.vector_env, PER_ENV.get(attr_name, attr_name))
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        # For all, as they share what they are made of
         setattr(self.vector_env, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
-        # One call serves the whole batch
-        return [getattr(self.vector_env, method_name)(*args, **kwargs)] * len(list(self._get_indices(indices)))
+        if len(list(self._get_indices(indices))) < self.num_envs:
+            raise ValueError(
+                "One call serves the whole batch of envs, not some of them: leave indices away, or make the envs one by one, "
+                "with vec_env_class=DummyVecEnv."
+            )
+        return [getattr(self.vector_env, method_name)(*args, **kwargs)] * self.num_envs
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         return [False] * len(list(self._get_indices(indices)))

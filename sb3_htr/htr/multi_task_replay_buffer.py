@@ -401,11 +401,13 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             rows = self.episodes.take(virtual)
         else:
             is_hindsight = relabelled[task_of_row]
+            of_store = is_hindsight.copy()
             if hindsight.elsewhere:
                 anywhere = len(context) + np.flatnonzero(is_hindsight[len(context) :])
                 anywhere = anywhere[self.relabel_rng.random(len(anywhere)) < hindsight.elsewhere]
                 virtual[anywhere] = self.relabel_rng.integers(len(index.rows), size=len(anywhere))
-            rows = self.take(virtual, is_hindsight, hindsight.store)
+                of_store[anywhere] = False
+            rows = self.take(virtual, of_store, hindsight.store)
             if not hindsight.is_relabelled:
                 where = np.flatnonzero(is_hindsight)
                 self.write_rewards(rows, where, reward_task[task_of_row[where]])
@@ -451,17 +453,17 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         labels = (chosen, np.ascontiguousarray(reward.T, dtype=np.float32), traj.task_free_reward, inferred.astype(np.float32))
         return RewardLabels(*(self.to_torch(x, copy=False) for x in labels))
 
-    def take(self, virtual: np.ndarray, is_hindsight: np.ndarray, store: EpisodeStore) -> np.ndarray:
+    def take(self, virtual: np.ndarray, of_store: np.ndarray, store: EpisodeStore) -> np.ndarray:
         """
         :param virtual: (n,) int, virtual rows
-        :param is_hindsight: (n,) bool, which of them are of another store than the buffer's own
+        :param of_store: (n,) bool, which of them are of another store than the buffer's own
         :param store: the other store
         :return: (n, width) float32, copies of these transitions
         """
         if store is self.episodes:
             return self.episodes.take(virtual)
         rows = np.empty((len(virtual), self.transitions.width), dtype=np.float32)
-        rows[~is_hindsight], rows[is_hindsight] = self.episodes.take(virtual[~is_hindsight]), store.take(virtual[is_hindsight])
+        rows[~of_store], rows[of_store] = self.episodes.take(virtual[~of_store]), store.take(virtual[of_store])
         return rows
 
     def write_rewards(self, rows: np.ndarray, where: np.ndarray, tasks: np.ndarray, reward_type: str = "sparse") -> None:

@@ -20,6 +20,7 @@ class StepMemo:
     def __init__(self, ask: Callable[[np.ndarray], np.ndarray]) -> None:
         self._ask = ask
         self._store: EpisodeStore | None = None
+        self._written = np.zeros(0, dtype=np.int64)
 
     def look_up(self, store: EpisodeStore, rows: np.ndarray) -> np.ndarray:
         """
@@ -27,7 +28,7 @@ class StepMemo:
         :param rows: int, any shape, rows of :attr:`EpisodeStore.rows` that hold data
         :return: int8, same shape, what the function says of them
         """
-        if store is not self._store:
+        if store is not self._store or len(store.written) < len(self._written):
             self._store, self._n_written = store, 0
             self._known, self._written = np.zeros((0, store.episode_length), dtype=np.int8), np.zeros(0, dtype=np.int64)
         if store.n_written != self._n_written:

@@ -15,6 +15,8 @@ MAX_TRANSITIONS = 24
 # Of a training: by measurement, the Point Robot (20 steps an episode) has learnt after 40,000, the rest is for the last digit;
 # Wheeled robot and ant (200) need 3,000 episodes
 MIN_TIMESTEPS, N_EPISODES = 150_000, 3_000
+# Arguments of PEARL
+BY_HORIZON = ("gamma", "n_episodes_per_task", "learning_starts", "gradient_steps", "batch_size", "context_size")
 
 
 def settings_for(max_episode_steps: int, n_tasks_per_rollout: int, n_episodes_per_task: int | None = None) -> dict[str, Any]:

@@ -38,7 +38,7 @@ from sb3_htr.common.saving import CheckedFiles, with_suffix
 from sb3_htr.common.training_state import Resumable
 from sb3_htr.common.vec_env import in_float32, make_task_vec_env
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
-from sb3_htr.pearl.horizon import complete, timesteps_for
+from sb3_htr.pearl.horizon import BY_HORIZON, complete, timesteps_for
 from sb3_htr.pearl.policies import PEARLPolicy
 
 # An adaptation gives up after an episode of so many times those of training: an env that never ends one would hang
@@ -102,27 +102,13 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         if env is not None:
             env = self._wrap_env(env)
             checks.check_spaces(env)
-        given = {
-            "gamma": gamma,
-            "n_episodes_per_task": n_episodes_per_task,
-            "learning_starts": learning_starts,
-            "gradient_steps": gradient_steps,
-            "batch_size": batch_size,
-            "context_size": context_size,
-        }
-        # Without an env, which is for files alone, the settings come from there
-        max_episode_steps = 1 if env is None else checks.get_max_episode_steps(env)
-        if env is not None:
-            # All envs are stepped, as often as it takes
-            n_tasks_per_rollout = -(-n_tasks_per_rollout // env.num_envs) * env.num_envs
-        settings = complete(given, max_episode_steps, n_tasks_per_rollout)
         super().__init__(
             policy=policy,
             env=env,  # type: ignore[arg-type]
-            gamma=settings["gamma"],
-            learning_starts=settings["learning_starts"],
-            gradient_steps=settings["gradient_steps"],
-            batch_size=settings["batch_size"],
+            gamma=gamma,  # type: ignore[arg-type]
+            learning_starts=learning_starts,  # type: ignore[arg-type]
+            gradient_steps=gradient_steps,  # type: ignore[arg-type]
+            batch_size=batch_size,  # type: ignore[arg-type]
             replay_buffer_class=buffer_class,
             replay_buffer_kwargs=replay_buffer_kwargs,
             policy_kwargs={} if policy_kwargs is None else dict(policy_kwargs),
@@ -133,9 +119,9 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         # SAC adds an argument for state-dependent exploration, which is not for us: z explores
         self.policy_kwargs.pop("use_sde")
         checks.check_keywords("policy_kwargs", self.policy_kwargs, self.policy_class)
-        self.context_size = settings["context_size"]
+        self.context_size: int = context_size  # type: ignore[assignment]
         self.n_tasks_per_rollout = n_tasks_per_rollout
-        self.n_episodes_per_task = settings["n_episodes_per_task"]
+        self.n_episodes_per_task: int = n_episodes_per_task  # type: ignore[assignment]
         self.task_bank: TaskBank | None = None
         #: Called after each update
         self.update_listeners: list[Callable[[], None]] = []
@@ -145,7 +131,8 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         self._warned_not_adapted = False
 
     def _setup_model(self) -> None:
-        # Given to load() in place of those of the file, they are what a user writes
+        # Not in the constructor: settings can be given to load() too, in place of those of the file
+        self._complete_settings()
         self.explorer, self.train_explorer = to_explorer(self.explorer), to_explorer(self.train_explorer)
         if self.env is None:
             # Loaded for prediction only: SB3 wants a buffer, we want no memory of it
@@ -158,6 +145,17 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
             super()._setup_model()
         self.knowledge = LatentKnowledge(self.policy.latent_dim).to(self.device)
         self._introduce_policy()
+
+    def _complete_settings(self) -> None:
+        # Without an env, which is for files alone, the settings come from there
+        max_episode_steps = 1
+        checks.check_numbers(n_tasks_per_rollout=(self.n_tasks_per_rollout, 1, float("inf")))
+        if self.env is not None:
+            max_episode_steps, n_envs = checks.get_max_episode_steps(self.env), self.env.num_envs
+            # All envs are stepped, as often as it takes
+            self.n_tasks_per_rollout = -(-self.n_tasks_per_rollout // n_envs) * n_envs
+        given = {name: getattr(self, name) for name in BY_HORIZON}
+        vars(self).update(complete(given, max_episode_steps, self.n_tasks_per_rollout))
 
     def _check_rollouts(self) -> None:
         explorer, n_episodes = self.train_explorer, self.n_episodes_per_task

@@ -121,18 +121,6 @@ class PEARL(OffPolicyMetaAlgorithm):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ) -> None:
-        infinity = float("inf")
-        check_numbers(
-            meta_batch_size=(meta_batch_size, 1, infinity),
-            target_update_interval=(target_update_interval, 1, infinity),
-            kl_coef=(kl_coef, 0.0, infinity),
-            reward_coef=(reward_coef, 0.0, infinity),
-            tau=(tau, 0.0, 1.0),
-        )
-        if tau == 0:
-            raise ValueError("tau is 0, with which the target critics would never learn: expected a number above 0, up to 1.")
-        if matmul_precision not in PRECISIONS:
-            raise ValueError(f"matmul_precision is {matmul_precision!r}, expected one of {list(PRECISIONS)}.")
         super().__init__(
             policy=policy,
             env=env,
@@ -167,6 +155,21 @@ class PEARL(OffPolicyMetaAlgorithm):
         self._posterior_watch = PosteriorWatch()
         if _init_setup_model:
             self._setup_model()
+
+    def _setup_model(self) -> None:
+        infinity = float("inf")
+        check_numbers(
+            meta_batch_size=(self.meta_batch_size, 1, infinity),
+            target_update_interval=(self.target_update_interval, 1, infinity),
+            kl_coef=(self.kl_coef, 0.0, infinity),
+            reward_coef=(self.reward_coef, 0.0, infinity),
+            tau=(self.tau, 0.0, 1.0),
+        )
+        if self.tau == 0:
+            raise ValueError("tau is 0, with which the target critics would never learn: expected a number above 0, up to 1.")
+        if self.matmul_precision not in PRECISIONS:
+            raise ValueError(f"matmul_precision is {self.matmul_precision!r}, expected one of {list(PRECISIONS)}.")
+        super()._setup_model()
 
     def _create_aliases(self) -> None:
         super()._create_aliases()

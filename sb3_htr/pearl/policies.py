@@ -130,18 +130,13 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
         super()._build(lr_schedule)
         self.normalizer = ObservationNormalizer(self.obs_dim) if self.normalize_observations else None
         self.encoder = self.encoder_class(self.context_dim, self.latent_dim, self.encoder_arch, self.activation_fn)
-        self.encoder.optimizer = self.optimizer_class(
-            self.encoder.parameters(),
-            lr=lr_schedule(1),  # type: ignore[call-arg]
-            **self.optimizer_kwargs,
-        )
-        action_dim = self.context_dim - self.obs_dim - 1
-        self.reward_model = RewardModel(self.obs_dim, action_dim, self.latent_dim)
-        self.reward_model.optimizer = self.optimizer_class(
-            self.reward_model.parameters(),
-            lr=lr_schedule(1),  # type: ignore[call-arg]
-            **self.optimizer_kwargs,
-        )
+        self.reward_model = RewardModel(self.obs_dim, self.context_dim - self.obs_dim - 1, self.latent_dim)
+        for network in (self.encoder, self.reward_model):
+            network.optimizer = self.optimizer_class(
+                network.parameters(),
+                lr=lr_schedule(1),  # type: ignore[call-arg]
+                **self.optimizer_kwargs,
+            )
         # z of predict() calls without a state: the prior mean
         self._z = th.zeros(1, self.latent_dim)
         self.critic_target.requires_grad_(False)

@@ -25,11 +25,13 @@ MAX_CONTEXT = 2**14
 EXPLORERS = ("explorer", "train_explorer")
 # Of an object, SB3 writes its plain attributes beside its type and its pickle
 TYPE, PICKLED = ":type:", ":serialized:"
+# How many transitions a replay buffer may have room for: it takes memory as they come, but for an index of its episodes
+MAX_BUFFER = 10**8
 # Arguments of PEARL that are numbers and take no memory, those that may be words, and counters
 NUMBERS = (
     *("learning_rate", "learning_starts", "batch_size", "tau", "gamma", "gradient_steps", "ent_coef", "target_entropy"),
     *("target_update_interval", "meta_batch_size", "context_size", "kl_coef", "reward_coef"),
-    *("n_tasks_per_rollout", "n_episodes_per_task"),
+    *("n_tasks_per_rollout", "n_episodes_per_task", "buffer_size"),
 )
 WORDS = {"ent_coef": r"auto(_(?=.*[1-9])\d+(\.\d+)?)?", "target_entropy": "auto", "matmul_precision": "highest|high|medium"}
 COUNTERS = ("num_timesteps", "_n_updates")
@@ -66,8 +68,9 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
         replay = data.get("replay_buffer_kwargs")
         replay = replay if isinstance(replay, dict) else {}
         settings["replay_buffer_kwargs"] = {name: replay[name] for name in REPLAY if name in replay and PICKLED not in replay}
-        if settings.get("context_size", 0) > MAX_CONTEXT:
-            raise ValueError(f"PEARL has no contexts of {settings['context_size']} steps here.")
+        for name, most in (("context_size", MAX_CONTEXT), ("buffer_size", MAX_BUFFER)):
+            if settings.get(name, 0) > most:
+                raise ValueError(f"PEARL has no {name} of {settings[name]} here: expected {most} at most.")
         counters = {name: data[name] for name in COUNTERS if type(data.get(name)) is int}
         settings["policy_kwargs"] = _policy_kwargs(data.get("policy_kwargs", {}))
     except FileNotFoundError:

@@ -53,15 +53,13 @@ def load_untrusted(
                 raise ValueError(
                     f"its policy has {name}: {value}, which only --trust restores, and that may run code of the file"
                 )
-        model = model_class(
-            model_class.DEFAULT_POLICY, env, device=device, policy_kwargs=policy_kwargs, **model_class.ACTS_WITH
-        )
+        settings = {**counts, **model_class.ACTS_WITH}
+        model = model_class(model_class.DEFAULT_POLICY, env, device=device, policy_kwargs=policy_kwargs, **settings)
         model.policy.load_state_dict(weights)
     except Exception as error:  # whatever a stranger can put into a file
         why = str(error).splitlines()[-1].strip()[:200] if isinstance(error, ValueError | RuntimeError) and str(error) else ""
         raise ValueError(f"{path} is damaged, or no {model_class.__name__} with the settings of its record: {why}") from None
-    for name, value in {**counts, "num_timesteps": n_steps}.items():
-        setattr(model, name, value)
+    model.num_timesteps = n_steps
     return model
 
 

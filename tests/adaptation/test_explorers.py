@@ -300,6 +300,8 @@ def test_the_learned_prior_draws_training_tasks_and_then_from_the_posterior(tiny
     assert 0.7 < seen.mean() < 1 and (places[seen, 5:] == 2).mean() > 0.9
     assert (places[~seen, 5:] == 2).mean() > 0.6, "its misses count, too"
     assert not adaptation.explorer.exploring().any()
+    mean, _ = adaptation.posterior()
+    assert len(np.unique(mean, axis=0)) > 1, "the encoder's posterior, too, is over all episodes"
 
 
 def test_what_is_known_about_z_before_a_reward(tiny_pearl: MakePEARL) -> None:

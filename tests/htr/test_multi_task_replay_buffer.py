@@ -15,7 +15,9 @@ from helpers import MakePEARL
 from helpers.experience import FAMILY, add_episode, assert_same, by_task, filled, make_buffer
 from htr_envs import PointRobotFamily
 from sb3_htr.htr import EpisodeClustering, SingleEpisodeRelabelling
+from sb3_htr.htr.episode_store import EpisodeStore
 from sb3_htr.htr.multi_task_replay_buffer import spread
+from sb3_htr.htr.relabel.base import HindsightDraw, Relabeller
 from sb3_htr.htr.transitions import Transitions
 
 RELABELLERS = ["SingleEpisodeRelabelling", "EpisodeClustering"]
@@ -275,6 +277,22 @@ def test_a_reward_hook_that_returns_nan_is_refused() -> None:
     buffer.task_family = Broken()
     with pytest.raises(ValueError, match="compute_reward returned NaN or infinity"):
         buffer.sample(4)
+
+
+class Apart(Relabeller):
+    """Has a store of its own, of episodes that are marked, and wants half of the RL batch from the replay."""
+
+    def draw(self, tasks: np.ndarray) -> HindsightDraw:
+        own = EpisodeStore(1, 1, 20, self.buffer.transitions.width)
+        own.add(0, np.full((20, self.buffer.transitions.width), 7.0, dtype=np.float32))
+        all_of_it = np.tile([0, 20], (len(tasks), 1))
+        return HindsightDraw(own, all_of_it, all_of_it, np.zeros((len(tasks), 2), np.float32), False, elsewhere=0.5)
+
+
+def test_elsewhere_is_the_replay_whatever_the_store_of_a_relabeller() -> None:
+    data = filled(n_episodes=12, relabel_probability=1.0, relabeller=Apart()).sample(20, meta_batch_size=30, context_size=20)
+    marked = (data.observations == 7).all(dim=1)
+    assert 0.4 < marked.float().mean() < 0.6 and (data.context.observations == 7).all()
 
 
 def test_hindsight_tasks_are_not_rounded_where_training_tasks_are_integers() -> None:

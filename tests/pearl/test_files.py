@@ -257,7 +257,17 @@ def test_a_file_is_loaded_as_what_it_is_and_with_settings_that_are_known(tiny_pe
     tiny_pearl().save(tmp_path / "model")
     with pytest.raises(ValueError, match=r"PEARL has no setting 'gama': did you mean gamma\?"):
         PEARL.load(tmp_path / "model", gama=0.9)
-    assert PEARL.load(tmp_path / "model", gamma=0.9, device="cpu").gamma == 0.9
+    with pytest.raises(ValueError, match="tau is 0, with which the target critics would never learn"):
+        PEARL.load(tmp_path / "model", tau=0.0)
+    with pytest.raises(ValueError, match="context_size is 0, expected a whole number of at least 1"):
+        PEARL.load(tmp_path / "model", context_size=0)
+    loaded = PEARL.load(tmp_path / "model", gamma=0.9, device="cpu", stats_window_size=7)
+    assert loaded.gamma == 0.9 and loaded._stats_window_size == 7
+    env = make_task_vec_env(ENV_ID, 3)
+    follows = PEARL.load(tmp_path / "model", env=env, gamma=None, gradient_steps=None, n_tasks_per_rollout=4)
+    plain = PEARL("MlpPolicy", env, n_tasks_per_rollout=6, n_episodes_per_task=follows.n_episodes_per_task)
+    for name in ("gamma", "gradient_steps", "n_tasks_per_rollout"):
+        assert getattr(follows, name) == getattr(plain, name), name
     SAC("MlpPolicy", "Pendulum-v1").save(tmp_path / "sac")
     with pytest.raises(ValueError, match="PEARL has no policies such as SACPolicy: is the file one of another algorithm"):
         PEARL.load(tmp_path / "sac")

@@ -143,4 +143,8 @@ def test_checkpoints_of_a_training_that_went_further_are_not_removed(tiny_pearl:
     assert kept[0].name == f"{3 * ROLLOUT}_steps"
     with pytest.raises(ValueError, match=rf"{3 * ROLLOUT}_steps is a checkpoint of another training, which went further"):
         tiny_pearl().learn(ROLLOUT, CheckpointCallback(1, str(tmp_path)))
+    model, callback = tiny_pearl(), CheckpointCallback(1, str(tmp_path))
+    callback.restore(model, load_latest(tmp_path)[1])
+    with pytest.raises(ValueError, match=rf"begins at 0 env steps, and its checkpoint is of {3 * ROLLOUT}: call learn\(rem"):
+        model.learn(ROLLOUT, callback)
     assert checkpoints(tmp_path) == kept

@@ -38,6 +38,7 @@ class LearnedPrior(FixedExploration, ParticleExplorer):
         self.infer(step)
         ended = np.flatnonzero(step.dones)
         if len(ended):
+            self.adaptation.infer(ended, keep=True)
             self._draw(ended)
 
     def _draw(self, envs: np.ndarray) -> None:

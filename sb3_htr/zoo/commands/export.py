@@ -30,8 +30,8 @@ KEPT_OF_RECORD = ("env_id", "method", "env_kwargs", "gym_packages", "seed", "n_t
 def export(agent: TrainedAgent, path: Path) -> dict[str, Any]:
     """
     Write a model file without optimizer states, replay, statistics of training and local paths. ``load`` of its class reads
-    it, and the commands find in it which env it is for. What acts is exact; the critics of SAC, whose values only rank
-    tasks, are kept in half precision, and their targets are the same as they.
+    it, and the commands find in it which env it is for. What acts is exact; the critics of SAC, whose values only rank tasks, are
+    kept in half precision, and their targets are the same as they. Of rivals, what only training needs is left at its default.
 
     :param agent: to export
     :param path: file to write
@@ -46,7 +46,7 @@ def export(agent: TrainedAgent, path: Path) -> dict[str, Any]:
         model.critic.half()
         for target, parameter in zip(model.critic_target.parameters(), model.critic.parameters(), strict=True):
             target.data = parameter.data
-    kept = {*keywords_of(type(model)), *ALSO_KEPT} - {"tensorboard_log"}
+    kept = {*keywords_of(type(model)), *ALSO_KEPT} - {"tensorboard_log", *getattr(type(model), "ACTS_WITH", ())}
     record = {key: agent.record[key] for key in KEPT_OF_RECORD if key in agent.record}
     which = "best on the validation tasks" if agent.path.stem == "best_model" else "last"
     record["command"] = training_command(agent.record)

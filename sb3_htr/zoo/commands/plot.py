@@ -79,7 +79,10 @@ def adapt(agent: TrainedAgent, args: argparse.Namespace) -> Adapted:
     record = run_adaptation(model.policy, env, adaptation, args.n_episodes, not args.stochastic, args.seed)
     latent = None
     if isinstance(adaptation, Adaptation):
-        particles, found = adaptation.knowledge.particles(), ~adaptation.exploring()
+        particles = adaptation.knowledge.particles()
+        found = ~adaptation.exploring()
+        if adaptation.knowledge.tells_success:
+            found &= adaptation.best_return > 0
         known_z = particles.z[particles.is_train].numpy()
         mean, deviation = adaptation.posterior()
         latent = Latent(tasks[found], mean[found], deviation[found], known_z)
@@ -230,7 +233,7 @@ def plot_adapted(
                 curves[name] = Curve(np.arange(1, args.n_episodes + 1), returns, successes, method_of[name])
             labels = ("return", "share of tasks solved (%)")
             plot_curves(curves, new("adaptation_curve"), about, "adaptation episode", labels)
-    if "paths" in args.only and first.tasks.shape[1] == 2:
+    if "paths" in args.only and first.record.achieved.shape[-1] == 2:
         # The label of --env is the env
         title = ", ".join(dict.fromkeys((env_id, label, f"{args.tasks} tasks", f"explorer {first.explorer}")))
         plot_adaptation_paths(first.record, first.tasks, first.goal_radius, first.start, new("adaptation_paths"), title)

@@ -65,7 +65,6 @@ class ProgressCallback(BaseCallback):
         self.logger.output_formats.append(self._output)
 
     def _end(self) -> None:
-        # rl_zoo3 may end the training of a callback a second time
         if self._output in self.logger.output_formats:
             self.logger.output_formats.remove(self._output)
             self._output.close()

@@ -30,7 +30,8 @@ def seconds_at(log: Path, steps: np.ndarray) -> np.ndarray:
     :param log: ``progress.csv`` of a training
     :param steps: (n,) env steps
     :return: (n,) seconds of training until then, between the rollouts that were logged around it. A training that went on from
-        a checkpoint counts from 0 again, which is put right. NaN where nothing tells them
+        a checkpoint counts from 0 again, which is put right; what was trained after the checkpoint and lost does not count.
+        NaN where nothing tells them
     """
     if not log.exists():
         return np.full(len(steps), np.nan)
@@ -42,5 +43,5 @@ def seconds_at(log: Path, steps: np.ndarray) -> np.ndarray:
     seconds = logged[:, 1]
     again = np.append(False, np.diff(seconds) < 0)
     before = np.cumsum(np.where(again, np.append(0.0, seconds[:-1]), 0.0))
-    # Rollouts after the checkpoint that it went on from are logged twice, and count as often as they were made
+    # Where logs of older versions have rollouts twice, both count
     return np.asarray(np.interp(steps, np.maximum.accumulate(logged[:, 0]), seconds + before))
