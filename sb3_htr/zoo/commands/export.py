@@ -30,8 +30,9 @@ KEPT_OF_RECORD = ("env_id", "method", "env_kwargs", "gym_packages", "seed", "n_t
 def export(agent: TrainedAgent, path: Path) -> dict[str, Any]:
     """
     Write a model file without optimizer states, replay, statistics of training and local paths. ``load`` of its class reads
-    it, and the commands find in it which env it is for. What acts is exact; the critics of SAC, whose values only rank tasks, are
-    kept in half precision, and their targets are the same as they. Of rivals, what only training needs is left at its default.
+    it, and the commands find in it which env it is for. What acts is exact; the critics of SAC, whose values only rank tasks,
+    are kept in half precision, and their targets are the same as they. Of rivals, what only training needs is left at its
+    default.
 
     :param agent: to export
     :param path: file to write
