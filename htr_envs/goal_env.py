@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -110,12 +111,13 @@ class HiddenGoalEnv(TaskEnv):
 
     ## Observation Space
 
-    `observation` of the GoalEnv, then its `achieved_goal`, in float32. `desired_goal` is left out, and so are all infos.
+    `observation` of the GoalEnv, then its `achieved_goal`, in float32, without bounds. `desired_goal` is left out, and so are all infos.
 
     ## Rewards
 
     - `reward_type="sparse"`: `1` where the GoalEnv's own `compute_reward` says that the goal is reached, else `0`. Both kinds
-      of sparse rewards, -1 and 0 or 0 and 1, become this one.
+      of sparse rewards, -1 and 0 or 0 and 1, become this one. An agent that was trained so and adapts to the GoalEnv itself,
+      or a robot, must be given 1 and 0 as well: add 1 where that pays 0 and -1.
     - `reward_type="dense"`: the reward of the GoalEnv with its own argument `reward_type="dense"`; minus the distance between
       achieved and desired goal where it has no such argument.
 
@@ -279,8 +281,17 @@ def hide_goal(env_id: str, **env_kwargs: Any) -> str:
     :param env_id: id of the GoalEnv; ``"module:id"`` imports the module that registers it.
     :param env_kwargs: arguments of the GoalEnv.
     :return: id of the family, ``HiddenGoal/`` and that of the GoalEnv (``/`` in it becomes ``-``).
+    :raises ValueError: if it is no id, or an argument is one of the family.
     :raises gymnasium.error.Error: if there is no such env, or its package is not installed.
     """
+    if not isinstance(env_id, str):
+        raise ValueError(f"hide_goal takes the id of a GoalEnv, got {env_id!r}: register the env, and give its id.")
+    of_family = sorted({*inspect.signature(HiddenGoalFamily).parameters} & env_kwargs.keys())
+    if of_family:
+        raise ValueError(
+            f"{of_family[0]} is an argument of the family, and not of {env_id}: "
+            f"gymnasium.make(hide_goal({env_id!r}), {of_family[0]}={env_kwargs[of_family[0]]!r})."
+        )
     spec = GoalEnvSource.find(env_id, env_kwargs).spec
     hidden_id = f"{NAMESPACE}/{spec.id.replace('/', '-')}"
     # the registration, not its id: in a process of its own the registry may not have it

@@ -219,6 +219,12 @@ class MetaEnv(gym.Env[FloatArray, FloatArray], ABC):
         return self._remember_observation(self._reset_state()), {"task_id": self.task_id}
 
     def _remember_observation(self, state: ArrayLike) -> FloatArray:
+        if isinstance(state, tuple) or np.shape(state) != self.observation_space.shape:
+            given = "a tuple" if isinstance(state, tuple) else f"shape {np.shape(state)}"
+            raise ValueError(
+                "_reset_state returns an observation; _step_state an observation, a task-free reward and whether the episode "
+                f"terminates. Expected an observation of shape {self.observation_space.shape}, got {given}."
+            )
         observation: FloatArray = np.array(state, dtype=self.observation_space.dtype)
         self._observation = observation.astype(np.float32)
         return observation
@@ -243,7 +249,13 @@ class MetaEnv(gym.Env[FloatArray, FloatArray], ABC):
         if self._observation is None:
             raise ResetNeeded("step was called before the first reset: call env.reset() first.")
         action = checked_action(action, self.action_space)
-        state, reward, terminated = self._step_state(action)
+        stepped = self._step_state(action)
+        if len(stepped) != 3:
+            raise ValueError(
+                "_step_state must return an observation, a task-free reward and whether the episode terminates, got "
+                f"{len(stepped)} values."
+            )
+        state, reward, terminated = stepped
         return action, self._remember_observation(state), reward, terminated
 
     def _current_task(self) -> tuple[int, FloatArray]:

@@ -17,8 +17,10 @@ from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL, many
-from htr_envs import PointRobotEnv, PointRobotFamily, PointRobotVectorEnv, check_task_env
+from htr_envs import DynamicsVectorEnv, PointRobotEnv, PointRobotFamily, PointRobotVectorEnv, check_task_env
+from htr_envs.point_robot import PointRobotDynamics
 from sb3_htr import PEARL, evaluate_adaptation, load_untrusted
+from sb3_htr.adaptation.callbacks import MetaEvalCallback
 from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
 from sb3_htr.rivals.rl2 import RL2
@@ -328,6 +330,148 @@ def test_what_cannot_be_trained_is_refused_in_one_sentence(
         main(["train", *arguments])
     assert "\n" not in str(refusal.value)
     assert not list(tmp_path.rglob("*_1")), "no folder of a run that there is not"
+
+
+@pytest.mark.parametrize(
+    ("env_id", "message"),
+    [
+        ("mine:Speed-v0", r"--env is 'mine:Speed-v0', with a module: give --gym-packages mine --env Speed-v0"),
+        ("SparsePointRobo-v0", r"There is no env SparsePointRobo-v0: did you mean SparsePointRobot-v0\? An env of your own"),
+        ("Xyz-v0", r"There is no env Xyz-v0: An env of your own is found once its module is imported, by --gym-packages"),
+    ],
+)
+def test_an_unknown_id_on_the_command_line_says_how_one_is_found(env_id: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        main(["train", "--env", env_id])
+
+
+def test_a_file_is_no_module() -> None:
+    with pytest.raises(ValueError, match=r"'\./door\.py' is no name of a module: .*--gym-packages door"):
+        main(["train", "--env", ENV_ID, "--gym-packages", "./door.py"])
+
+
+def test_settings_in_the_wrong_place() -> None:
+    with pytest.raises(ValueError, match="relabel_probability is a setting within replay_buffer_kwargs: -params"):
+        main(["train", "--env", ENV_ID, "-params", "relabel_probability:0.5"])
+
+
+def test_what_is_positional_in_sac_and_means_something_else_here_is_refused() -> None:
+    with pytest.raises(TypeError, match="positional arguments"):
+        PEARL("MlpPolicy", ENV_ID, 3e-4, 100_000, 100, 256, 0.005, 0.99, 1)  # type: ignore[call-arg]
+
+
+def test_one_update_a_rollout_is_warned_of() -> None:
+    with pytest.warns(UserWarning, match=r"gradient_steps is 1, the updates after a rollout of 4000 env steps.*every 20"):
+        PEARL("MlpPolicy", ENV_ID, gradient_steps=1)
+
+
+class Accumulating(PointRobotFamily):
+    """What was solved once stays solved."""
+
+    def is_success(self, traj: Any, task: Any) -> Any:
+        return np.logical_or.accumulate(super().is_success(traj, task), axis=-1)
+
+    def compute_reward(self, traj: Any, task: Any, reward_type: str = "sparse") -> Any:
+        return self.is_success(traj, task).astype(np.float32)
+
+
+class Forgetful(PointRobotFamily):
+    """Its env pays a step penalty of which its hook knows nothing."""
+
+    def compute_reward(self, traj: Any, task: Any, reward_type: str = "sparse") -> Any:
+        return self.is_success(traj, task).astype(np.float32)
+
+
+class Penalized(PointRobotDynamics):
+    def step(self, actions: Any) -> Any:
+        states, task_free, terminated = super().step(actions)
+        return states, task_free - np.float32(0.1), terminated
+
+
+@pytest.mark.parametrize(
+    ("family", "dynamics", "message"),
+    [
+        (Accumulating, PointRobotDynamics, "compute_reward of a whole episode differs from .* of its steps one by one"),
+        (
+            Forgetful,
+            Penalized,
+            r"A step that does not solve its task.* returned 0, and its info.* is -0\.1",
+        ),
+    ],
+)
+def test_families_that_break_their_promises_are_refused_in_the_first_rollout(
+    tiny_pearl: MakePEARL, family: Any, dynamics: Any, message: str
+) -> None:
+    env = BatchedTaskVecEnv(DynamicsVectorEnv(family(goal_distance=0.1), dynamics(4), max_episode_steps=20))
+    with pytest.raises(ValueError, match=message):
+        tiny_pearl(env).learn(ROLLOUT)
+
+
+class EndsAtGoal(gym.Wrapper[Any, Any, Any, Any]):
+    def step(self, action: Any) -> Any:
+        obs, reward, terminated, truncated, info = super().step(action)
+        return obs, reward, terminated or info["is_success"], truncated, info
+
+
+def test_episodes_that_end_where_they_are_solved_are_warned_of(tiny_pearl: MakePEARL) -> None:
+    env = EndsAtGoal(gym.make(ENV_ID, goal_distance=0.1))
+    with pytest.warns(UserWarning, match="Episodes end where their task is solved, and only there"):
+        tiny_pearl(env, n_tasks_per_rollout=4).learn(ROLLOUT)
+
+
+class Robot(gym.Env[Any, Any]):
+    """Has a body and rewards, and no tasks."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (2,))
+    action_space = spaces.Box(-1.0, 1.0, (2,), np.float64)
+
+    def __init__(self, length: int) -> None:
+        self.length, self.n_steps = length, 0
+
+    def reset(self, **kwargs: Any) -> Any:
+        return np.zeros(2, dtype=np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        self.n_steps += 1
+        return np.zeros(2, dtype=np.float32), float(self.n_steps == 3), self.n_steps % self.length == 0, False, {}
+
+
+def test_a_robot_need_not_know_the_bounds_and_types_of_its_spaces(tiny_pearl: MakePEARL) -> None:
+    assert tiny_pearl().adapt(Robot(20), n_episodes=2).returns.tolist() == [1.0, 0.0]
+
+
+def test_robots_without_end_are_given_up_whatever_was_loaded_with_the_model(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    tiny_pearl().save(tmp_path / "model")
+    with pytest.raises(ValueError, match="An episode goes on after 200 steps, 10 times what those of training had"):
+        PEARL.load(tmp_path / "model").adapt(Robot(10**9), n_episodes=1)
+
+
+def test_what_evaluations_are_given_by_mistake(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    with pytest.raises(ValueError, match=r"tasks is 'valid', expected one of \['test', 'validation', 'train'\]"):
+        evaluate_adaptation(model, ENV_ID, tasks="valid")
+    with pytest.raises(ValueError, match=r"tasks have shape \(\), expected \(n_tasks, task_dim\)"):
+        evaluate_adaptation(model, ENV_ID, 5)  # type: ignore[arg-type]
+    with pytest.warns(UserWarning, match="No reward"):
+        agent = model.adapt(gym.make(ENV_ID), n_episodes=1)
+    with pytest.raises(ValueError, match=r"AdaptedAgent does not adapt: .*evaluate_policy"):
+        evaluate_adaptation(agent, ENV_ID)  # type: ignore[arg-type]
+    validation = PointRobotFamily().validation_tasks
+    ours, theirs = (evaluate_adaptation(model, ENV_ID, tasks, n_episodes=1) for tasks in ("validation", validation))
+    np.testing.assert_array_equal(ours, theirs)
+    assert len(MetaEvalCallback(ENV_ID, tasks="train").tasks) == 80
+
+
+@pytest.mark.parametrize("z", [np.zeros(3), np.zeros((2, 4)), np.zeros((1, 3))])
+def test_an_explorer_whose_z_has_another_shape(tiny_pearl: MakePEARL, z: np.ndarray) -> None:
+    adaptation = tiny_pearl().start_adaptation(2, "aggregate")
+    adaptation.explorer.z = z
+    with pytest.raises(ValueError, match=r"The z of the explorer 'aggregate' has shape .*, expected \(2, 3\)"):
+        adaptation.act(np.zeros((2, 2), dtype=np.float32))
+    adaptation.explorer.z = np.zeros((2, 3))  # numpy's own float64 will do
+    assert adaptation.act(np.zeros((2, 2), dtype=np.float32)).shape == (2, 2)
+    with pytest.raises(ValueError, match="n_envs is 0"):
+        tiny_pearl().start_adaptation(0)
 
 
 def test_only_the_envs_of_a_model_can_be_adapted_to(tiny_pearl: MakePEARL) -> None:

@@ -22,7 +22,7 @@ class Step(NamedTuple):
     :param rewards: (n_envs,)
     :param next_observations: (n_envs, obs_dim), the last one of its episode where one ended
     :param dones: (n_envs,) bool, where an episode ended
-    :param infos: one dict per env
+    :param infos: one dict per env, which only meta-training needs
     """
 
     observations: np.ndarray
@@ -30,7 +30,7 @@ class Step(NamedTuple):
     rewards: np.ndarray
     next_observations: np.ndarray
     dones: np.ndarray
-    infos: list[dict[str, Any]]
+    infos: list[dict[str, Any]] = []  # noqa: RUF012 nobody writes to it
 
 
 class Adaptation:
@@ -81,8 +81,11 @@ class Adaptation:
 
     @property
     def z(self) -> np.ndarray:
-        """(n_envs, latent_dim), the task variable to act with."""
-        return self.explorer.z
+        """(n_envs, latent_dim) float32, the task variable to act with."""
+        z, shape = np.asarray(self.explorer.z, dtype=np.float32), (self.n_envs, self.policy.latent_dim)
+        if z.shape != shape:
+            raise ValueError(f"The z of the explorer {self.explorer.name!r} has shape {z.shape}, expected {shape}.")
+        return z
 
     def act(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
         """

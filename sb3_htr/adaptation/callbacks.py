@@ -9,11 +9,12 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import EvalCallback
 
-from sb3_htr.adaptation.evaluation import MetaLearner, record_adaptation
+from sb3_htr.adaptation.evaluation import N_ENVS, MetaLearner, record_adaptation, task_set
 from sb3_htr.adaptation.explorers import to_explorer
 from sb3_htr.adaptation.first_success import first_success
 from sb3_htr.common.atomic import WRITE_ERRORS, atomic_path, reason
 from sb3_htr.common.checks import get_task_family
+from sb3_htr.common.vec_env import make_task_vec_env
 
 
 class MetaEvalCallback(EvalCallback):
@@ -25,8 +26,8 @@ class MetaEvalCallback(EvalCallback):
     (n,), ``results`` (n, n_tasks), the returns of the last episode, and ``returns`` and ``successes``
     (n, n_tasks, n_eval_episodes). A training that ends before its first evaluation is evaluated at its end.
 
-    :param eval_env: env of the task family
-    :param tasks: ``"validation"``, ``"test"`` or task vectors (n_tasks, task_dim)
+    :param eval_env: env of the task family, VecEnv or registered id
+    :param tasks: ``"validation"``, ``"test"``, ``"train"`` or task vectors (n_tasks, task_dim)
     :param n_eval_episodes: adaptation episodes per task (PEARL's reference: 20)
     :param explorer: an :class:`sb3_htr.adaptation.Explorer`, its name, or its name and settings; the model's own by default
     :param kwargs: arguments of SB3's ``EvalCallback``
@@ -41,11 +42,11 @@ class MetaEvalCallback(EvalCallback):
         explorer: Any = None,
         **kwargs: Any,
     ) -> None:
+        if isinstance(eval_env, str):
+            eval_env = make_task_vec_env(eval_env, N_ENVS)
         super().__init__(eval_env, n_eval_episodes=n_eval_episodes, **kwargs)
         if isinstance(tasks, str):
-            if tasks not in ("validation", "test"):
-                raise ValueError(f'tasks is {tasks!r}, expected "validation", "test" or an array of task vectors.')
-            tasks = getattr(get_task_family(self.eval_env), f"{tasks}_tasks")
+            tasks = task_set(get_task_family(self.eval_env), tasks)
         self.tasks: np.ndarray = np.asarray(tasks)
         self.explorer = None if explorer is None else to_explorer(explorer)
         self.returns: list[np.ndarray] = []

@@ -19,7 +19,13 @@ from sb3_htr.common.checks import (
     get_task_family,
 )
 from sb3_htr.common.random_state import seeded_actions
+from sb3_htr.common.type_aliases import TaskFamily
 from sb3_htr.common.vec_env import make_task_vec_env
+
+#: Sets of tasks that a family has
+TASK_SETS = ("test", "validation", "train")
+# Of an env that is given by its id
+N_ENVS = 20
 
 
 class Named(Protocol):
@@ -123,10 +129,27 @@ def _by_episode(steps: np.ndarray, episode: np.ndarray, n_episodes: int) -> np.n
     return result
 
 
+def task_set(family: TaskFamily, tasks: str | np.ndarray) -> np.ndarray:
+    """
+    :param family: of an env
+    :param tasks: ``"train"``, ``"validation"``, ``"test"``, or task vectors
+    :return: (n_tasks, task_dim) float32
+    :raises ValueError: for another word, or an array of another shape
+    """
+    if isinstance(tasks, str):
+        if tasks not in TASK_SETS:
+            raise ValueError(f"tasks is {tasks!r}, expected one of {list(TASK_SETS)}, or an array of task vectors.")
+        tasks = getattr(family, f"{tasks}_tasks")
+    vectors = np.asarray(tasks, dtype=np.float32)
+    if vectors.ndim != 2 or len(vectors) == 0:
+        raise ValueError(f"tasks have shape {vectors.shape}, expected (n_tasks, task_dim) with at least one task.")
+    return vectors
+
+
 def record_adaptation(
     model: MetaLearner,
     env: VecEnv | gym.Env | str,
-    tasks: np.ndarray | None = None,
+    tasks: str | np.ndarray | None = None,
     n_episodes: int = 20,
     explorer: Any = None,
     deterministic: bool = True,
@@ -137,23 +160,26 @@ def record_adaptation(
 
     :param model: as for :func:`evaluate_adaptation`, and so are all arguments and what is raised
     :param env: env, VecEnv or registered id
-    :param tasks: (n_tasks, task_dim)
+    :param tasks: (n_tasks, task_dim), or the name of a set
     :param n_episodes: adaptation episodes per task
     :param explorer: an explorer, its name, or its name and settings
     :param deterministic: mean actions instead of samples
     :param seed: seed of env, z and sampled actions
     :return: returns, successes and achieved tasks
     """
-    n_tasks = 20 if tasks is None else len(tasks)
+    if not hasattr(model, "start_adaptation"):
+        raise ValueError(
+            f"{type(model).__name__} does not adapt: pass the model of meta-training, or evaluate an adapted agent by "
+            "stable_baselines3's evaluate_policy."
+        )
+    n_tasks = N_ENVS if tasks is None or isinstance(tasks, str) else np.shape(tasks)[0] if np.ndim(tasks) else 1
     if isinstance(env, str):
         env = make_task_vec_env(env, max(n_tasks, 1), seed)
     check_is_env(env)
     if isinstance(env, gym.Env):
         env = BaseAlgorithm._wrap_env(env, monitor_wrapper=False)
     model.check_env(env)
-    tasks = get_task_family(env).test_tasks if tasks is None else np.asarray(tasks, dtype=np.float32)
-    if tasks.ndim != 2 or len(tasks) == 0:
-        raise ValueError(f"tasks have shape {tasks.shape}, expected (n_tasks, task_dim) with at least one task.")
+    tasks = task_set(get_task_family(env), "test" if tasks is None else tasks)
     get_max_episode_steps(env)
     generator = th.Generator().manual_seed(seed)
     env.seed(seed)
@@ -177,7 +203,7 @@ def record_adaptation(
 def evaluate_adaptation(
     model: MetaLearner,
     env: VecEnv | gym.Env | str,
-    tasks: np.ndarray | None = None,
+    tasks: str | np.ndarray | None = None,
     n_episodes: int = 20,
     explorer: Any = None,
     deterministic: bool = True,
@@ -190,7 +216,7 @@ def evaluate_adaptation(
 
     :param model: a PEARL, or a rival
     :param env: env, VecEnv (its envs adapt side by side, each to a task of its own) or registered id
-    :param tasks: (n_tasks, task_dim), by default the test tasks of the env
+    :param tasks: (n_tasks, task_dim), or ``"train"``, ``"validation"`` or ``"test"`` (default), tasks of the env
     :param n_episodes: adaptation episodes per task; 20 in PEARL's reference
     :param explorer: an :class:`sb3_htr.adaptation.Explorer`, its name, or its name and settings; the model's own by default;
         ``"prior"`` is PEARL's protocol

@@ -59,6 +59,29 @@ def check_spaces(env: VecEnv) -> None:
             )
 
 
+def check_fits(env: VecEnv, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+    """
+    :param env: to adapt in; a robot need not say how its observations are bounded, and the spaces may have another dtype
+    :param observation_space: of training
+    :param action_space: of training
+    :raises ValueError: if observations have another shape than there, or other bounds where both have some; or actions another
+        shape or other bounds
+    """
+    for name, here, there in (
+        ("Observation", env.observation_space, observation_space),
+        ("Action", env.action_space, action_space),
+    ):
+        boxes = isinstance(here, spaces.Box) and isinstance(there, spaces.Box)
+        if not boxes or here.shape != there.shape or not _bounds_fit(here, there, name == "Observation"):
+            raise ValueError(f"{name} spaces do not match: {here} here, {there} in training.")
+
+
+def _bounds_fit(here: Any, there: Any, may_be_unknown: bool) -> bool:
+    both = np.stack([[here.low, here.high], [there.low, there.high]])
+    unknown = may_be_unknown & ~np.isfinite(both).all(axis=0)
+    return bool((unknown | np.isclose(*both)).all())
+
+
 def check_numbers(**numbers: tuple[Any, float, float]) -> None:
     """
     :param numbers: name of a setting, its value, and the smallest and largest value that it may have; with an int as the

@@ -39,6 +39,8 @@ class CheckedFiles(BaseAlgorithm):
         check_keywords(cls.__name__, kwargs, cls, also=keywords_of(BaseAlgorithm.load))
         if "stats_window_size" in kwargs:  # has another name in SB3's models
             kwargs["_stats_window_size"] = kwargs.pop("stats_window_size")
+        if str(path).endswith(".pt"):
+            raise ValueError(f"{path} is no model: an agent that is adapted to a task is loaded by AdaptedAgent.load.")
         return super().load(path, env, *args, **kwargs)
 
     def _setup_model(self) -> None:

@@ -1,6 +1,7 @@
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.htr.relabel import (
     EpisodeClustering,
+    HindsightDraw,
     HindsightForesight,
     HindsightInference,
     HindsightTaskStrategy,
@@ -10,6 +11,7 @@ from sb3_htr.htr.relabel import (
 
 __all__ = [
     "EpisodeClustering",
+    "HindsightDraw",
     "HindsightForesight",
     "HindsightInference",
     "HindsightTaskStrategy",

@@ -1,7 +1,6 @@
 """Task-indexed replay with hindsight task relabelling at sample time."""
 
 import copy
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -17,10 +16,8 @@ from sb3_htr.common.task_reward import ROUNDING, task_reward
 from sb3_htr.common.type_aliases import Context, MultiTaskSamples, RewardLabels, TaskFamily
 from sb3_htr.htr.episode_store import EpisodeStore
 from sb3_htr.htr.relabel import RELABELLERS, Relabeller
+from sb3_htr.htr.reward_hook import check_reward_hook
 from sb3_htr.htr.transitions import Transitions
-
-# What a success may be worth without a warning: by measurement, 1 and 10 are learnt, 0.1 and 100 are not
-WORTH = 0.3, 30.0
 
 
 def spread(rng: np.random.Generator, ranges: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -280,48 +277,12 @@ class MultiTaskReplayBuffer(ReplayBuffer):
 
     def check_reward_hook(self, episodes: Sequence[tuple[int, np.ndarray]]) -> None:
         """
-        Warns of successes that are worth far less or more than the settings suit.
+        See :func:`sb3_htr.htr.reward_hook.check_reward_hook`; nothing is checked of a family that tells no rewards.
 
         :param episodes: training tasks and transitions (length, width) of some episodes
-        :raises ValueError: if the reward hook disagrees with what the env gave for them, or a success is worth nothing
         """
-        if not self.tells_rewards:
-            return
-        rows = np.concatenate([episode for _, episode in episodes])
-        task = np.repeat([task for task, _ in episodes], [len(episode) for _, episode in episodes])
-        traj = self.transitions.trajectory(rows[:, None])
-        computed = self.task_family.compute_reward(traj, self.task_family.train_tasks[task])[:, 0]
-        given = rows[:, self.transitions.reward]
-        wrong = ~np.isclose(given, computed, rtol=1e-4, atol=1e-4)
-        if wrong.any():
-            i = int(wrong.argmax())
-            raise ValueError(
-                f"The env gave {given[i]:g} for a step of task {task[i]}, but its compute_reward gives {computed[i]:g}: "
-                "relabelled rewards would be of another task family. Run htr_envs.check_task_env(env) to find out why."
-            )
-        ends = np.cumsum([len(episode) for _, episode in episodes]) - 1
-        last = self.transitions.trajectory(rows[ends, None])
-        achieved = self.task_family.hindsight_task(last, 0)
-        if not self.task_family.is_success(last, achieved).all():
-            raise ValueError(
-                "hindsight_task names a task that its own step does not solve, by is_success: hindsight would teach what did "
-                "not happen. Run htr_envs.check_task_env(env) to find out more."
-            )
-        reward = self.task_family.compute_reward(last, achieved)
-        worth = task_reward(reward, last.task_free_reward)[:, 0]
-        if (worth <= 0).any():
-            i = int(worth.argmin())
-            raise ValueError(
-                f"A step is worth {reward[i, 0]:g} under the task that it solves, and its task-free reward is "
-                f"{last.task_free_reward[i, 0]:g}, so that nothing tells the success: info['task_free_reward'] must be what a "
-                "step returns that solves nothing, which is -1 where rewards are -1 and 0."
-            )
-        if not WORTH[0] <= (typical := float(np.median(worth))) <= WORTH[1]:
-            warnings.warn(
-                f"A success is worth about {typical:.2g} here, and the settings suit 1 to 10: with 0.1 or 100, the "
-                "Point Robot is not learnt. Scale the rewards of the task family.",
-                stacklevel=2,
-            )
+        if self.tells_rewards:
+            check_reward_hook(self.task_family, self.transitions, episodes, self.relabel_probability > 0)
 
     def discard_open_episodes(self) -> None:
         """Forget unfinished episodes; to be called when the envs are reset before their episodes end."""
@@ -391,6 +352,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         relabelled = self.relabel_rng.random(meta_batch_size) < self.relabel_probability
         hindsight = self.relabeller.draw(tasks[relabelled]) if relabelled.any() else None
         if hindsight is not None:
+            hindsight.check(int(relabelled.sum()), reward_task.shape[1])
             context_source[relabelled], batch_source[relabelled] = hindsight.context, hindsight.batch
             reward_task[relabelled] = hindsight.tasks
         context, n_context = spread(self._rng, context_source, context_size)

@@ -17,7 +17,6 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, TrainFreq
-from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.sac import SAC
 
@@ -38,11 +37,13 @@ from sb3_htr.common.saving import CheckedFiles, with_suffix
 from sb3_htr.common.training_state import Resumable
 from sb3_htr.common.vec_env import in_float32, make_task_vec_env
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
-from sb3_htr.pearl.horizon import BY_HORIZON, complete, timesteps_for
+from sb3_htr.pearl.horizon import BY_HORIZON, STEPS_PER_UPDATE, complete, timesteps_for
 from sb3_htr.pearl.policies import PEARLPolicy
 
 # An adaptation gives up after an episode of so many times those of training: an env that never ends one would hang
 ENDLESS = 10
+# Env steps for each update that are warned of if they are more: SAC's gradient_steps are 1, but for each env step
+MAX_STEPS_PER_UPDATE = 1000
 
 SelfMetaAlgorithm = TypeVar("SelfMetaAlgorithm", bound="OffPolicyMetaAlgorithm")
 
@@ -122,6 +123,8 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         self.context_size: int = context_size  # type: ignore[assignment]
         self.n_tasks_per_rollout = n_tasks_per_rollout
         self.n_episodes_per_task: int = n_episodes_per_task  # type: ignore[assignment]
+        #: Of training; None if the model has had no env yet
+        self.max_episode_steps: int | None = None
         self.task_bank: TaskBank | None = None
         #: Called after each update
         self.update_listeners: list[Callable[[], None]] = []
@@ -156,6 +159,14 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
             self.n_tasks_per_rollout = -(-self.n_tasks_per_rollout // n_envs) * n_envs
         given = {name: getattr(self, name) for name in BY_HORIZON}
         vars(self).update(complete(given, max_episode_steps, self.n_tasks_per_rollout))
+        if self.env is not None:
+            self.max_episode_steps = max_episode_steps
+            rollout = self.n_tasks_per_rollout * self.n_episodes_per_task * max_episode_steps
+            if rollout > MAX_STEPS_PER_UPDATE * self.gradient_steps:
+                warnings.warn(
+                    f"gradient_steps is {self.gradient_steps}, the updates after a rollout of {rollout} env steps. Left away, "
+                    f"they are one for every {STEPS_PER_UPDATE}."
+                )
 
     def _check_rollouts(self) -> None:
         explorer, n_episodes = self.train_explorer, self.n_episodes_per_task
@@ -395,10 +406,10 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
     def check_env(self, env: VecEnv) -> None:
         """
         :param env: to adapt in
-        :raises ValueError: if its spaces are not those of training, or it normalizes
+        :raises ValueError: if its spaces do not fit those of training, or it normalizes
         """
         checks.check_is_not_normalized(env)
-        check_for_correct_spaces(self._wrap_env(env), self.observation_space, self.action_space)
+        checks.check_fits(self._wrap_env(env), self.observation_space, self.action_space)
 
     def start_adaptation(
         self,
@@ -418,6 +429,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         """
         chosen = self.explorer if explorer in (None, self.explorer.name) else to_explorer(explorer)
         self._check_explorer(chosen)
+        checks.check_numbers(n_envs=(n_envs, 1, float("inf")))
         return Adaptation(self.policy, self.knowledge, chosen, n_envs, self.context_size, generator, is_training)
 
     def adapt(
@@ -464,8 +476,8 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         adaptation = self.start_adaptation(1, explorer, th.Generator().manual_seed(seed))
         returns, successes = np.zeros(n_episodes), np.zeros(n_episodes, dtype=bool)
         act = partial(adaptation.act, deterministic=deterministic)
-        # Known unless the model was loaded without an env
-        longest = np.inf if self.replay_buffer is None else ENDLESS * self.replay_buffer.max_episode_steps
+        # None in files of older versions
+        longest = np.inf if self.max_episode_steps is None else ENDLESS * self.max_episode_steps
         length = 0
         obs = vec_env.reset()
         if task is not None and np.ndim(task) > 0:

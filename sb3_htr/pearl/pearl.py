@@ -98,6 +98,7 @@ class PEARL(OffPolicyMetaAlgorithm):
         batch_size: int | None = None,
         tau: float = 0.01,
         gamma: float | None = None,
+        *,
         gradient_steps: int | None = None,
         replay_buffer_class: type[MultiTaskReplayBuffer] | None = None,
         replay_buffer_kwargs: dict[str, Any] | None = None,

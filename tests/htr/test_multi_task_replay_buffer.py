@@ -295,6 +295,24 @@ def test_elsewhere_is_the_replay_whatever_the_store_of_a_relabeller() -> None:
     assert 0.4 < marked.float().mean() < 0.6 and (data.context.observations == 7).all()
 
 
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"context": np.zeros((30, 2))}, "context of a HindsightDraw has shape .* and dtype float64, expected whole numbers"),
+        ({"batch": np.tile([5, 5], (30, 1))}, "batch of a HindsightDraw has a range that is empty or not within the 20 rows"),
+        ({"batch": np.tile([0, 21], (30, 1))}, "batch of a HindsightDraw has a range that is empty or not within the 20 rows"),
+        ({"tasks": np.zeros(30)}, r"tasks of a HindsightDraw have shape \(30,\), expected \(30, 2\)"),
+    ],
+)
+def test_draws_of_a_relabeller_that_cannot_be(wrong: dict[str, Any], message: str) -> None:
+    class Wrong(Apart):
+        def draw(self, tasks: np.ndarray) -> HindsightDraw:
+            return super().draw(tasks)._replace(**wrong)
+
+    with pytest.raises(ValueError, match=message):
+        filled(relabel_probability=1.0, relabeller=Wrong()).sample(20, meta_batch_size=30, context_size=20)
+
+
 def test_hindsight_tasks_are_not_rounded_where_training_tasks_are_integers() -> None:
     """As those of a family of one's own may be."""
     buffer = filled(relabel_probability=1.0, relabeller=SingleEpisodeRelabelling(elsewhere=0.0))

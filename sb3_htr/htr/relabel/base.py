@@ -51,6 +51,26 @@ class HindsightDraw(NamedTuple):
     is_relabelled: bool
     elsewhere: float = 0.0
 
+    def check(self, m: int, task_dim: int) -> None:
+        """
+        :param m: number of rows that were to be relabelled
+        :param task_dim: length of a task
+        :raises ValueError: if it is not for so many, or ranges are not within the store
+        """
+        n_rows = len(self.store.index().rows)
+        for name, ranges in (("context", self.context), ("batch", self.batch)):
+            if ranges.shape != (m, 2) or ranges.dtype.kind != "i":
+                raise ValueError(
+                    f"{name} of a HindsightDraw has shape {ranges.shape} and dtype {ranges.dtype}, expected whole numbers, "
+                    f"({m}, 2)."
+                )
+            if not ((ranges[:, 0] >= 0) & (ranges[:, 0] < ranges[:, 1]) & (ranges[:, 1] <= n_rows)).all():
+                raise ValueError(
+                    f"{name} of a HindsightDraw has a range that is empty or not within the {n_rows} rows of its store."
+                )
+        if self.tasks.shape != (m, task_dim):
+            raise ValueError(f"tasks of a HindsightDraw have shape {self.tasks.shape}, expected ({m}, {task_dim}).")
+
 
 class Relabeller(ABC):
     """

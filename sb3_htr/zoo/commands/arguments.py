@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from htr_envs.goal_env import find_hidden
+from sb3_htr.adaptation.evaluation import TASK_SETS
 from sb3_htr.adaptation.explorers import EXPLORERS
 from sb3_htr.zoo.run.agents import TrainedAgent, agent_at, agent_for
 from sb3_htr.zoo.run.trust import check_env_kwargs, import_packages, refuse
 
-TASK_SETS = ("test", "validation", "train")
 OF_PACKAGES = "modules of your own that register envs, methods or experiments"
 
 

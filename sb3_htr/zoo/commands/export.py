@@ -22,7 +22,10 @@ EXAMPLE = """  sb3-htr export runs/htr-ser/SparsePointRobot-v0_1 -o my_agent
   sb3-htr export runs --film --push-to-hub USER                    as USER/pearl-SparsePointRobot-v0
   sb3-htr export runs -o agent.zip                                 the file alone"""
 # What a loaded model needs beside the arguments of its class
-ALSO_KEPT = ("observation_space", "action_space", "policy_class", "n_envs", "num_timesteps", "_n_updates", "shown")
+ALSO_KEPT = (
+    *("observation_space", "action_space", "policy_class", "n_envs", "max_episode_steps"),
+    *("num_timesteps", "_n_updates", "shown"),
+)
 # Of a run's record, what holds on other machines too
 KEPT_OF_RECORD = ("env_id", "method", "env_kwargs", "gym_packages", "seed", "n_timesteps", "hyperparams", "versions")
 

@@ -1,10 +1,13 @@
 """``sb3-htr train``: rl_zoo3's training with the algorithm of a method in it, and with evaluations that adapt."""
 
 import argparse
+import difflib
 import traceback
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
+
+import gymnasium as gym
 
 from htr_envs.goal_env import find_hidden
 from sb3_htr.common.resume import n_steps_done
@@ -96,6 +99,8 @@ def main(argv: Sequence[str]) -> None:
                 rest[i] = str(Path(word).resolve())  # wherever the run goes on from
         given = [*env, *rest, *packages]
         find_hidden(args.env or "")
+        if env:
+            _check_id(args.env)
     keep_freed_memory()
     try:
         run_rl_zoo(program, algorithm, [*default_arguments(algorithm), *given], args.method, run, args.trust)
@@ -106,3 +111,16 @@ def main(argv: Sequence[str]) -> None:
         raise ValueError(
             f"{error}: the values of -params and --env-kwargs are Python, with strings in quotes, as in \"explorer:'prior'\"."
         ) from error
+
+
+def _check_id(env_id: str) -> None:
+    if env_id in gym.registry:
+        return
+    module, colon, name = env_id.rpartition(":")
+    if colon:
+        raise ValueError(f"--env is {env_id!r}, with a module: give --gym-packages {module} --env {name}.")
+    nearest = difflib.get_close_matches(env_id, gym.registry, n=1)
+    meant = f"did you mean {nearest[0]}? " if nearest else ""
+    raise ValueError(
+        f"There is no env {env_id}: {meant}An env of your own is found once its module is imported, by --gym-packages MODULE."
+    )

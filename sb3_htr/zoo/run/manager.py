@@ -50,6 +50,11 @@ from sb3_htr.zoo.run.trust import PACKAGES, plain_settings, refuse
 
 # What a YAML file may have beside the arguments of the algorithm
 ZOO_SETTINGS = ("n_envs", "n_timesteps", "env_wrapper", "vec_env_wrapper", "callback", "env_kwargs")
+# What is often given beside these dicts in place of in them
+SETTINGS_WITHIN = {
+    "replay_buffer_kwargs": {"relabel_probability", "relabeller", "rl_reward_type", "context_episodes"},
+    "policy_kwargs": {"latent_dim", "net_arch", "encoder_arch", "normalize_observations"},
+}
 # Tasks that an evaluation adapts to side by side
 N_EVAL_ENVS = 20
 
@@ -138,6 +143,9 @@ class MetaExperimentManager(ExperimentManager):
                 "normalizes observations itself (normalize_observations of policy_kwargs)."
             )
         model_class = self.method.algorithm.model_class()
+        for name in ("replay_buffer_kwargs", "policy_kwargs"):
+            if model_class is PEARL and (misplaced := sorted(SETTINGS_WITHIN[name] & hyperparams.keys())):
+                raise ValueError(f"{misplaced[0]} is a setting within {name}: -params \"{name}:{{'{misplaced[0]}':...}}\".")
         check_keywords(model_class.__name__, hyperparams, model_class, also=ZOO_SETTINGS)
         check_numbers(n_envs=(hyperparams.get("n_envs", 1), 1, float("inf")))
         processed = super()._preprocess_hyperparams(hyperparams)

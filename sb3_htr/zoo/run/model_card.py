@@ -11,6 +11,7 @@ from sb3_htr.zoo.run.algorithm import Algorithm
 from sb3_htr.zoo.run.arguments import given_arguments
 from sb3_htr.zoo.run.hub import model_name
 from sb3_htr.zoo.run.method import DEFAULT, get_method, methods
+from sb3_htr.zoo.run.trust import PACKAGES
 
 TAGS = (
     "deep-reinforcement-learning",
@@ -129,7 +130,8 @@ def model_card(record: dict[str, Any], scores: dict[str, AdaptationRecord], repo
     algorithm = (method or get_method(DEFAULT)).algorithm
     model = model_name(env_id, algorithm.name)
     file = f"{model}.zip"
-    watch = f"sb3-htr enjoy {file}"
+    own = "".join(f" --gym-packages {package}" for package in record["gym_packages"] or () if package not in PACKAGES)
+    watch = f"sb3-htr enjoy {file}{own}"
     path = f'"{file}"'
     if repo_id is not None:
         imports += "from huggingface_hub import hf_hub_download\n"
@@ -138,7 +140,7 @@ def model_card(record: dict[str, Any], scores: dict[str, AdaptationRecord], repo
         named = ("" if model == model_name(env_id) else f" --algo {algorithm.name}") + (
             "" if repo_name == model else f" -name {repo_name}"
         )
-        watch = f"sb3-htr load_from_hub --env {env_id} -orga {user}{named}\n$ sb3-htr enjoy --env {env_id}"
+        watch = f"sb3-htr load_from_hub --env {env_id} -orga {user}{named}\n$ sb3-htr enjoy --env {env_id}{own}"
     use = snippet(algorithm, path, f'gymnasium.make("{env_id}"{kwargs})', min(n_episodes, 10))
     of_explorers = OF_EXPLORERS if algorithm.also_explores_by else ""
     versions = ", ".join(f"{package} {version}" for package, version in record.get("versions", {}).items())
@@ -160,7 +162,7 @@ has not seen, with mean actions.{of_explorers}
 ## Use
 
 ```console
-$ pip install 'sb3_htr[zoo,video]'
+$ pip install '.[zoo,video]'  # in a checkout of sb3_htr
 $ {watch}
 ```
 

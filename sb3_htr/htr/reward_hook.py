@@ -1,0 +1,107 @@
+"""Says whether what an env gives is what its task family tells."""
+
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+
+from sb3_htr.common.task_reward import ROUNDING, task_reward
+from sb3_htr.common.type_aliases import TaskFamily
+from sb3_htr.htr.transitions import Transitions
+
+# What a success may be worth without a warning: by measurement, 1 and 10 are learnt, 0.1 and 100 are not
+WORTH = 0.3, 30.0
+# How many episodes are told of as a whole, too
+MAX_WHOLE = 8
+
+
+def check_reward_hook(
+    family: TaskFamily, columns: Transitions, episodes: Sequence[tuple[int, np.ndarray]], is_relabelled: bool
+) -> None:
+    """
+    Warns of successes that are worth far less or more than the settings suit, and of those that end their episode.
+
+    :param family: tells rewards and successes
+    :param columns: of transitions
+    :param episodes: training tasks and transitions (length, width) of some episodes
+    :param is_relabelled: whether episodes get other tasks
+    :raises ValueError: if the reward hook disagrees with what the env gave, or with itself; if a success is worth nothing, or
+        something else is worth something
+    """
+    rows = np.concatenate([episode for _, episode in episodes])
+    task = np.repeat([task for task, _ in episodes], [len(episode) for _, episode in episodes])
+    tasks = family.train_tasks[task]
+    traj = columns.trajectory(rows[:, None])
+    given, computed = rows[:, columns.reward], family.compute_reward(traj, tasks)[:, 0]
+    solved = family.is_success(traj, tasks)[:, 0]
+    wrong = ~np.isclose(given, computed, rtol=1e-4, atol=1e-4)
+    if wrong.any():
+        i = int(wrong.argmax())
+        raise ValueError(
+            f"The env gave {given[i]:g} for a step of task {task[i]}, but its compute_reward gives {computed[i]:g}: "
+            "relabelled rewards would be of another task family. Run htr_envs.check_task_env(env) to find out why."
+        )
+    _check_whole_episodes(family, columns, episodes[:MAX_WHOLE], computed, solved)
+    _check_worth(family, columns, np.stack([episode[-1] for _, episode in episodes]))
+    worthless = ~solved & (np.abs(given - traj.task_free_reward[:, 0]) > 1e-4 + 10 * ROUNDING * np.abs(given))
+    if worthless.any():
+        i = int(worthless.argmax())
+        raise ValueError(
+            f"A step that does not solve its task, by is_success, returned {given[i]:g}, and its info['task_free_reward'] is "
+            f"{traj.task_free_reward[i, 0]:g}: they must be the same. compute_reward is what the task pays plus "
+            "traj.task_free_reward."
+        )
+    ended = rows[:, columns.done] > 0
+    if is_relabelled and ended.any() and (ended == solved).all():
+        warnings.warn(
+            "Episodes end where their task is solved, and only there. Relabelled ones do not: nothing is learnt of staying at "
+            "a goal, and ends tell what the task is. Let the env go on up to its time limit.",
+            stacklevel=2,
+        )
+
+
+def _check_whole_episodes(
+    family: TaskFamily,
+    columns: Transitions,
+    episodes: Sequence[tuple[int, np.ndarray]],
+    computed: np.ndarray,
+    solved: np.ndarray,
+) -> None:
+    end = 0
+    for task, episode in episodes:
+        start, end = end, end + len(episode)
+        whole, own = columns.trajectory(episode[None]), family.train_tasks[[task]]
+        for name, of_all, of_each in (
+            ("compute_reward", family.compute_reward(whole, own), computed[start:end]),
+            ("is_success", family.is_success(whole, own), solved[start:end]),
+        ):
+            if not np.allclose(of_all, of_each, rtol=1e-4, atol=1e-4):
+                raise ValueError(
+                    f"{name} of a whole episode differs from {name} of its steps one by one: it must tell of each step alone, "
+                    "whatever was before. Run htr_envs.check_task_env(env) to find out more."
+                )
+
+
+def _check_worth(family: TaskFamily, columns: Transitions, last: np.ndarray) -> None:
+    traj = columns.trajectory(last[:, None])
+    achieved = family.hindsight_task(traj, 0)
+    if not family.is_success(traj, achieved).all():
+        raise ValueError(
+            "hindsight_task names a task that its own step does not solve, by is_success: hindsight would teach what did "
+            "not happen. Run htr_envs.check_task_env(env) to find out more."
+        )
+    reward = family.compute_reward(traj, achieved)
+    worth = task_reward(reward, traj.task_free_reward)[:, 0]
+    if (worth <= 0).any():
+        i = int(worth.argmin())
+        raise ValueError(
+            f"A step is worth {reward[i, 0]:g} under the task that it solves, and its task-free reward is "
+            f"{traj.task_free_reward[i, 0]:g}, so that nothing tells the success: info['task_free_reward'] must be what a "
+            "step returns that solves nothing, which is -1 where rewards are -1 and 0."
+        )
+    if not WORTH[0] <= (typical := float(np.median(worth))) <= WORTH[1]:
+        warnings.warn(
+            f"A success is worth about {typical:.2g} here, and the settings suit 1 to 10: with 0.1 or 100, the "
+            "Point Robot is not learnt. Scale the rewards of the task family.",
+            stacklevel=2,
+        )
