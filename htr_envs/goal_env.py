@@ -111,7 +111,8 @@ class HiddenGoalEnv(TaskEnv):
 
     ## Observation Space
 
-    `observation` of the GoalEnv, then its `achieved_goal`, in float32, without bounds. `desired_goal` is left out, and so are all infos.
+    `observation` of the GoalEnv, then its `achieved_goal`, in float32, without bounds. `desired_goal` is left out, and
+    so are all infos.
 
     ## Rewards
 

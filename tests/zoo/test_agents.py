@@ -239,7 +239,7 @@ def test_the_console_answers_mistakes_in_one_sentence(
     for arguments, message in (
         (["enjoy", "--env", "Nothing-v0"], "There is no trained agent for Nothing-v0"),
         (["train", "--env", ENV_ID, "--env-kwargs", "goal_dist:1"], "TypeError: .* unexpected keyword argument 'goal_dist'"),
-        (["train", "--env", "SparsePointRobt-v0"], "you maybe meant SparsePointRobot-v0"),
+        (["train", "--env", "SparsePointRobt-v0"], "did you mean SparsePointRobot-v0"),
         (["evaluate", str(SHIPPED), "--env-kwargs", "goal_distance:-1"], "goal_distance is -1, expected a number above 0"),
     ):
         monkeypatch.setattr(sys, "argv", ["sb3-htr", *arguments])
