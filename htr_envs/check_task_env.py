@@ -16,6 +16,7 @@ from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory
 
 MAX_STEPS = 200  # of an episode that are looked at
 N_DRAWS = 30
+NOT_REPEATABLE = "The same seed, task and actions gave another episode: use no other randomness than self.np_random."
 TASK_SETS = ("train_tasks", "validation_tasks", "test_tasks")
 # What tells the reward of a step under any task; a family of a MetaEnv has none of these
 REWARD_HOOKS = ("compute_reward", "is_success", "hindsight_task")
@@ -71,6 +72,7 @@ def _check_interface(env: gym.Env[Any, Any]) -> TaskFamily:
     for what, space in (("observation_space", env.observation_space), ("action_space", env.action_space)):
         flat = isinstance(space, spaces.Box) and len(space.shape) == 1 and np.issubdtype(space.dtype, np.floating)
         _require(flat, f"The {what} must be a one-dimensional Box of floats.")
+    _require(env.action_space.is_bounded(), "The action_space has no bounds: give it some, and scale actions in the env.")  # type: ignore[attr-defined]
     limited = any(env.has_wrapper_attr(name) for name in ("_max_episode_steps", "max_episode_steps"))
     limited = limited or (env.spec is not None and env.spec.max_episode_steps is not None)
     _require(limited, "The env has no time limit: register it with max_episode_steps, and pass gymnasium.make(id).")
@@ -166,10 +168,20 @@ def _check_rewards(env: gym.Env[Any, Any], family: TaskFamily, episode: Episode,
     _require(shaped and _same(successes, episode.successes), "is_success does not give the info['is_success'] that step gave.")
 
 
+def _has_dense(family: TaskFamily, traj: Trajectory, task: FloatArray) -> bool:
+    """A family may refuse it, as it does an unknown type."""
+    try:
+        family.compute_reward(traj, task, "dense")
+    except ValueError:
+        return False
+    return True
+
+
 def _check_reward_types(family: TaskFamily, traj: Trajectory, task: FloatArray) -> None:
-    dense = family.compute_reward(traj, task, "dense")
+    reward_type = "dense" if _has_dense(family, traj, task) else "sparse"
+    dense = family.compute_reward(traj, task, reward_type)
     finite = isinstance(dense, np.ndarray) and dense.dtype == np.float32 and bool(np.isfinite(dense).all())
-    _require(finite, "compute_reward with reward_type='dense' must return finite float32 numbers.")
+    _require(finite, f"compute_reward with reward_type={reward_type!r} must return finite float32 numbers.")
     try:
         family.compute_reward(traj, task, "no such type")
     except ValueError:
@@ -204,14 +216,15 @@ def _check_vectorized(name: str, hook: Callable[[Trajectory, Any], Any], traj: T
 
 
 def _check_pure(family: TaskFamily, traj: Trajectory) -> None:
+    before = [values.copy() for values in traj]
     task, other_task = family.train_tasks[0], family.train_tasks[-1]
     calls: dict[str, Callable[[], Any]] = {
         "compute_reward": lambda: family.compute_reward(traj, task),
-        "compute_reward with reward_type='dense'": lambda: family.compute_reward(traj, other_task, "dense"),
         "is_success": lambda: family.is_success(traj, task),
         "hindsight_task": lambda: family.hindsight_task(traj, 0),
     }
-    before = [values.copy() for values in traj]
+    if _has_dense(family, traj, other_task):
+        calls["compute_reward with reward_type='dense'"] = lambda: family.compute_reward(traj, other_task, "dense")
     first, second = ([_call(f"{name} fails on an episode.", call) for name, call in calls.items()] for _ in range(2))
     for name, result, again in zip(calls, first, second, strict=True):
         _require(_same(result, again), f"{name} gives something else when it is called again: it must be pure.")
@@ -271,6 +284,8 @@ def _check_episode(env: gym.Env[Any, Any], family: TaskFamily, seed: int) -> Non
     in_range = 0 <= plain.task_id < len(family.train_tasks)
     _require(in_range, f"After set_task(None) an episode had task_id {plain.task_id}: the env must draw a training task.")
     traj = plain.traj
+    again = _play(env, family, seed, family.train_tasks[plain.task_id], traj.actions)
+    _require(all(map(_same, traj[:3], again.traj[:3])), NOT_REPEATABLE)
     _check_pure(family, traj)
     _check_rewards(env, family, plain, family.train_tasks[plain.task_id])
     own_tasks = _check_hindsight(family, plain)
@@ -281,14 +296,16 @@ def _check_episode(env: gym.Env[Any, Any], family: TaskFamily, seed: int) -> Non
         return family.compute_reward(steps, task, "dense")
 
     _check_vectorized("compute_reward", family.compute_reward, traj, tasks)
-    _check_vectorized("compute_reward with 'dense'", dense_reward, traj, tasks)
+    if _has_dense(family, traj, tasks[0]):
+        _check_vectorized("compute_reward with 'dense'", dense_reward, traj, tasks)
     _check_vectorized("is_success", family.is_success, traj, tasks)
     _check_sparse(family, traj, own_tasks)
 
     # Random episodes rarely see a sparse reward. The same episode again under a task that it solved has one for sure.
     for task in tasks[1:]:
         solved = _play(env, family, seed, task, traj.actions)
-        _require(solved.task_id == -1, f"A task given as a vector had task_id {solved.task_id}: it must be -1.")
+        refused = f"reset does not honour options={{'task': vector}}: the task_id is {solved.task_id}, it must be -1."
+        _require(solved.task_id == -1, refused)
         _check_no_leak(plain, solved)
         _require(solved.successes.any(), "reset does not honour options={'task': vector}: the episode does not solve it.")
         _check_rewards(env, family, solved, task)
@@ -309,7 +326,7 @@ def _check_dependent_episode(env: gym.Env[Any, Any], family: TaskFamily, seed: i
     same = all(
         map(_same, (plain.rewards, plain.terminated, *plain.traj[:3]), (again.rewards, again.terminated, *again.traj[:3]))
     )
-    _require(same, "The same seed, task and actions gave another episode: use no other randomness than self.np_random.")
+    _require(same, NOT_REPEATABLE)
     same_start = _same(plain.traj.observations[0], other.traj.observations[0])
     _require(same_start, "The task leaks into the first observation: same seed, another task, another one.")
 

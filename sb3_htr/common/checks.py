@@ -49,7 +49,7 @@ def check_has_env(env: VecEnv | None) -> None:
 def check_spaces(env: VecEnv) -> None:
     """
     :param env: env to train on
-    :raises ValueError: if observations or actions are not vectors of bounded or unbounded floats
+    :raises ValueError: if observations or actions are not vectors of floats, or actions have no bounds
     """
     for name, space in (("observation", env.observation_space), ("action", env.action_space)):
         if not isinstance(space, spaces.Box) or len(space.shape) != 1:
@@ -57,6 +57,8 @@ def check_spaces(env: VecEnv) -> None:
                 f"The {name} space is {space}, but PEARL needs a Box of one axis: flatten it with a wrapper, hide the goal of "
                 "a GoalEnv with htr_envs.hide_goal, and put images through an encoder of your own."
             )
+    if not env.action_space.is_bounded():  # type: ignore[attr-defined]
+        raise ValueError(f"The action space {env.action_space} has no bounds: give it some, and scale actions in the env.")
 
 
 def check_fits(env: VecEnv, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:

@@ -181,8 +181,9 @@ class OneStepOnly(LineFamily):
         return super().compute_reward(*args).reshape(1)
 
 
-@breaks("compute_reward with reward_type='dense' fails on an episode. It raised ValueError")
 class NoDenseReward(LineFamily):
+    """Which breaks nothing: a dense proxy is one's own choice."""
+
     def compute_reward(self, traj: Any, task: Any, reward_type: str = "sparse") -> Any:
         if reward_type == "dense":
             raise ValueError("no such type")
@@ -362,9 +363,24 @@ class IgnoresVectors(LineEnv):
         super()._give(key, self.test_tasks[0] if key == "task" and np.isfinite(value).all() else value)
 
 
-@breaks("A task given as a vector had task_id 0")
+@breaks("reset does not honour options={'task': vector}: the task_id is 0, it must be -1")
 class VectorWithTrainingId(LineEnv):
     task_id = property(lambda self: max(0, self._current_task()[0]))
+
+
+@breaks("The same seed, task and actions gave another episode: use no other randomness than self.np_random")
+class OtherRandomness(LineEnv):
+    def _reset_state(self) -> Any:
+        super()._reset_state()
+        self.x = float(np.random.uniform(-0.1, 0.1))
+        return self.observe()
+
+
+@breaks("The action_space has no bounds")
+class UnboundedActions(LineEnv):
+    def __init__(self, family: Any = None) -> None:
+        super().__init__(family)
+        self.action_space = spaces.Box(-np.inf, np.inf, (1,), np.float32)
 
 
 @breaks("reset does not honour options={'task_id': i}")

@@ -8,7 +8,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 
-from helpers.broken_envs import BROKEN, LineEnv, LineFamily, column
+from helpers.broken_envs import BROKEN, LineEnv, LineFamily, NoDenseReward, column
 from helpers.carts import CartEnv
 from htr_envs import PointRobotEnv, check_task_env
 
@@ -173,6 +173,10 @@ def test_broken_infos(key: str, value: Any, sentence: str) -> None:
 
 
 # ---------------------------------------------------------------- broken behaviour
+
+
+def test_a_family_needs_no_dense_proxy() -> None:
+    check_task_env(LineEnv(NoDenseReward()))
 
 
 @pytest.mark.parametrize(("broken", "sentence"), BROKEN)
