@@ -13,7 +13,7 @@ from sb3_htr.adaptation.evaluation import N_ENVS, MetaLearner, record_adaptation
 from sb3_htr.adaptation.explorers import to_explorer
 from sb3_htr.adaptation.first_success import first_success
 from sb3_htr.common.atomic import WRITE_ERRORS, atomic_path, reason
-from sb3_htr.common.checks import get_task_family
+from sb3_htr.common.checks import check_numbers, get_task_family
 from sb3_htr.common.vec_env import make_task_vec_env
 
 
@@ -42,6 +42,7 @@ class MetaEvalCallback(EvalCallback):
         explorer: Any = None,
         **kwargs: Any,
     ) -> None:
+        check_numbers(n_eval_episodes=(n_eval_episodes, 1, float("inf")))
         if isinstance(eval_env, str):
             eval_env = make_task_vec_env(eval_env, N_ENVS)
         super().__init__(eval_env, n_eval_episodes=n_eval_episodes, **kwargs)
@@ -87,6 +88,9 @@ class MetaEvalCallback(EvalCallback):
         # Of a training that is shorter than the time between two evaluations, and was not interrupted
         if self.eval_freq > 0 and not self.returns and self.num_timesteps >= self.model._total_timesteps:
             self._evaluate()
+        elif self.returns and self.log_path is not None:
+            # No later one makes up for a file that could not be written
+            self._write(f"{self.log_path}.npz", self._save_results)
 
     def _evaluate(self) -> bool:
         """Whether training goes on."""

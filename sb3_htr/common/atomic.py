@@ -7,6 +7,7 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from uuid import uuid4
 
 # What writing a file can end in: a full disk (of which torch makes a RuntimeError), a clock that zip files do not know
 WRITE_ERRORS = (OSError, RuntimeError, ValueError, struct.error)
@@ -35,7 +36,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     if not os.access(path.parent, os.W_OK):  # before whoever writes has done any work
         raise PermissionError(errno.EACCES, "The folder cannot be written to", str(path.parent))
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    # In a container, each process may be number 1
+    temporary = path.with_name(f".{path.stem}.{uuid4().hex[:12]}.tmp{path.suffix}")
     try:
         yield temporary
         for file in temporary.rglob("*") if temporary.is_dir() else [temporary]:

@@ -6,7 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
+from sb3_htr.common.arrays import load_arrays
+
+# What to do with raw results that cannot be used
+REMOVE = "Remove it: the same command then evaluates its run again, without training it again."
 
 KwArgs = dict[str, Any]
 
@@ -94,7 +97,7 @@ class Cell:
         :param path: raw results; those of older versions say less of what they are of, or nothing
         :raises ValueError: if they are of something else
         """
-        raw = np.load(path)
+        raw = load_arrays(path, advice=REMOVE)
         given, own = json.loads(str(raw["cell"])) if "cell" in raw else {}, json.loads(self.facts())
         if different := [name for name, value in given.items() if value != own.get(name)]:
             name = different[0]

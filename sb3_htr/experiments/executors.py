@@ -4,7 +4,8 @@ import os
 import socket
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
+from threading import Thread
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
@@ -39,8 +40,20 @@ class Processes(ThreadPoolExecutor):
         return super().submit(_in_a_process, fn, *args, **kwargs)
 
 
+def _end_with_parent() -> None:
+    """What it runs goes on from its checkpoint, where the driver was killed."""
+
+    def watch() -> None:
+        parent = parent_process()
+        assert parent is not None
+        parent.join()
+        os._exit(1)
+
+    Thread(target=watch, daemon=True).start()
+
+
 def _in_a_process(fn: Callable[..., T], *args: Any, **kwargs: Any) -> T:
-    with ProcessPoolExecutor(1, get_context("spawn")) as process:
+    with ProcessPoolExecutor(1, get_context("spawn"), initializer=_end_with_parent) as process:
         return process.submit(fn, *args, **kwargs).result()
 
 

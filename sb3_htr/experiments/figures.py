@@ -7,6 +7,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from htr_envs.point_robot import STEP_SIZE, PointRobotFamily
+from sb3_htr.common.arrays import load_arrays
 from sb3_htr.experiments.calibration import expected_calibration_error
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.protocol import scores
@@ -17,14 +18,19 @@ from sb3_htr.zoo.plots.style import COLOURS, curve_styles, save
 Results = dict[Cell, Path]
 
 
-def by_variant(results: Results) -> dict[str, list[tuple[Cell, Any]]]:
+def by_variant(results: Results, and_env: bool = True) -> dict[str, list[tuple[Cell, Any]]]:
     """
     :param results: raw results of the cells
+    :param and_env: whether runs of a variant in several envs are several curves
     :return: cells and their arrays, by variant
     """
     groups: dict[str, list[tuple[Cell, Any]]] = {}
+    envs: dict[str, set[str]] = {}
+    for cell in results:
+        envs.setdefault(cell.variant, set()).add(str(cell.env_kwargs))
     for cell, result in results.items():
-        groups.setdefault(cell.variant, []).append((cell, np.load(result)))
+        name = cell.variant if len(envs[cell.variant]) == 1 or not and_env else f"{cell.variant} {cell.env_kwargs}"
+        groups.setdefault(name, []).append((cell, load_arrays(result)))
     return groups
 
 
@@ -123,7 +129,7 @@ def goal_distance(results: Results, path: Path) -> None:
     :param path: picture to write
     """
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
-    groups = by_variant(results)
+    groups = by_variant(results, and_env=False)
     for (colour, _), (variant, runs) in zip(curve_styles([*groups]), groups.items(), strict=True):
         x = sorted({cell.env_kwargs["goal_distance"] for cell, _ in runs})
         ordered = sorted(runs, key=lambda run: (run[0].env_kwargs["goal_distance"], run[0].seed))

@@ -1,5 +1,6 @@
 """Every experiment: which methods, on which env, for how long, with how many seeds."""
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -84,8 +85,9 @@ class Experiment:
         :param seeds: runs of each variant, as many as the experiment asks for by default
         :param scale: times its env steps
         :return: the runs, seed by seed
+        :raises ValueError: if two would be in one folder
         """
-        return [
+        cells = [
             Cell(
                 experiment=self.name,
                 models_of=self.models_of or self.name,
@@ -103,6 +105,13 @@ class Experiment:
             for seed in range(1, (seeds or self.seeds) + 1)
             for variant in self.variants
         ]
+        twice = [name for name, n in Counter(cell.name for cell in cells).items() if n > 1]
+        if twice:
+            raise ValueError(
+                f"Several runs of {self.name} would be in the folder {twice[0]}: give the variants names that differ in "
+                "letters or digits."
+            )
+        return cells
 
     def _evaluations_of(self, method: str) -> tuple[Evaluation, ...]:
         """Of its final models; one that explores in a way of its own is evaluated once in each env."""

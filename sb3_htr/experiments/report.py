@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.experiments import figures
 from sb3_htr.experiments.calibration import expected_calibration_error
-from sb3_htr.experiments.cell import Cell, Evaluation
+from sb3_htr.experiments.cell import REMOVE, Cell, Evaluation
 from sb3_htr.experiments.grid import Experiment
 from sb3_htr.experiments.protocol import EVAL_SEEDS, METRICS, scores
 from sb3_htr.experiments.runner import LOGGED, machine
@@ -19,6 +20,8 @@ from sb3_htr.zoo.plots.intervals import iqm_difference, iqm_interval
 
 RETURN = "last_episode_return"
 STEPS = "env_steps_to_solved"
+# What a report is made of
+NEEDED = ("timesteps", "curve", "solved", "elapsed_s", "calibration")
 # Of the code that trained, and of that which evaluated
 COMMITS = ("commit", "evaluation_commit")
 
@@ -69,7 +72,7 @@ def summarize(command: str, results: dict[Cell, Path]) -> dict[str, Any]:
     for cell, path in results.items():
         runs = groups.setdefault(str(cell.env_kwargs), {}).setdefault(cell.variant, Runs([], []))
         runs.cells.append(cell)
-        runs.raws.append(np.load(path))
+        runs.raws.append(load_arrays(path))
     compared = [[*variants.values()] for variants in groups.values()]
     all_runs = [runs for group in compared for runs in group]
     return {
@@ -129,15 +132,21 @@ def _rounded(interval: tuple[float, float, float]) -> dict[str, float]:
 def check(results: dict[Cell, Path]) -> None:
     """
     :param results: raw results of cells
-    :raises ValueError: if one is of something else, or lacks something, as those of older versions do
+    :raises ValueError: if one is damaged, of something else, or lacks something, as those of older versions do; or if runs of
+        one variant were trained with different hyperparameters
     """
+    trained_by: dict[tuple[str, str], tuple[Path, dict[str, Any]]] = {}
     for cell, path in results.items():
         cell.check_result(path)
-        needed = {"solved", "elapsed_s", *COMMITS, *(f"returns_{evaluation.name}" for evaluation in cell.evaluations)}
-        if missing := sorted(needed - set(np.load(path).files)):
+        returns = (f"returns_{evaluation.name}" for evaluation in cell.evaluations)
+        raw = load_arrays(path, (*NEEDED, *COMMITS, *LOGGED, *returns), f"It may be of another version. {REMOVE}")
+        # Older ones do not say
+        own = json.loads(str(raw.get("hyperparams", "null")))
+        first, theirs = trained_by.setdefault((cell.variant, str(cell.env_kwargs)), (path, own))
+        if own and theirs and (different := sorted(key for key in {*own, *theirs} if own.get(key) != theirs.get(key))):
             raise ValueError(
-                f"{path} is of another version, and lacks {missing}: remove it. The same command then evaluates its run "
-                "again, without training it again."
+                f"{path} was trained with other {different} than {first}: has a YAML file changed in between? Move one of the "
+                "two away with its run, or choose other --runs."
             )
 
 
@@ -153,7 +162,9 @@ def write(command: str, experiment: Experiment, results: dict[Cell, Path], folde
     """
     check(results)
     folder.mkdir(parents=True, exist_ok=True)
-    raw = {f"{cell.name}/{key}": value for cell, path in results.items() for key, value in np.load(path).items()}
+    raw: dict[str, Any] = {
+        f"{cell.name}/{key}": value for cell, path in results.items() for key, value in load_arrays(path).items()
+    }
     with atomic_path(folder / "raw.npz") as path:
         np.savez_compressed(path, **raw)
     with atomic_path(folder / "summary.json") as path:

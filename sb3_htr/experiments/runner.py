@@ -1,9 +1,11 @@
 """One cell, in whatever process an executor calls it: claimed, trained from where it was, and evaluated."""
 
+import io
+import json
 import platform
 import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import Any
@@ -12,13 +14,14 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 import htr_envs  # noqa: F401 registers the envs
+from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.resume import checkpoints
 from sb3_htr.common.versions import commit, named, processor
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.protocol import evaluate
 from sb3_htr.zoo.commands import train
-from sb3_htr.zoo.run.agents import RECORD, agent_at, file_stem, find_runs, read_record
+from sb3_htr.zoo.run.agents import RECORD, agent_at, file_stem, find_runs, n_steps_of, read_record
 from sb3_htr.zoo.run.algorithm import Model
 from sb3_htr.zoo.run.arguments import ALWAYS
 from sb3_htr.zoo.run.learned import seconds_at
@@ -90,7 +93,8 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
         if trained is None:
             raise KeyboardInterrupt
     run, model = trained
-    evaluations = np.load(run / "evaluations.npz")
+    advice = f"Its run has to be trained again: remove {folder}."
+    evaluations = load_arrays(run / "evaluations.npz", ("timesteps", "results", "successes"), advice)
     progress = np.genfromtxt(run / "progress.csv", delimiter=",", names=True, deletechars="")
     logged = progress.dtype.names or ()
     record = read_record(run / RECORD)
@@ -101,6 +105,7 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
         "solved": evaluations["successes"][..., -1],
         "elapsed_s": seconds_at(run / "progress.csv", evaluations["timesteps"]),
         "cell": cell.facts(),
+        "hyperparams": json.dumps(record["hyperparams"], sort_keys=True),
         # Of the code as it was when the training began, and as it is now
         "commit": named(record),
         "evaluation_commit": named(commit()),
@@ -119,7 +124,7 @@ def find_finished(cell: Cell, folder: Path) -> tuple[Path, Model] | None:
     for run in find_runs(folder) if any(folder.rglob(RECORD)) else ():
         record = read_record(run / RECORD)
         for key in ("env_id", "env_kwargs", "method", "seed", "n_timesteps"):
-            if record[key] != getattr(cell, key):
+            if record[key] != json.loads(json.dumps(getattr(cell, key))):  # which knows no tuples
                 raise ValueError(
                     f"{run} has {key} {record[key]!r}, but {cell.experiment}/{cell.name} needs {getattr(cell, key)!r}: "
                     f"move this run away, or choose other --runs."
@@ -131,10 +136,8 @@ def find_finished(cell: Cell, folder: Path) -> tuple[Path, Model] | None:
                 "run away, or choose other --runs."
             )
         # An interrupted training leaves a model, too
-        if (run / f"{file_stem(cell.env_id)}.zip").exists():
-            model = agent_at(run, "last").load()
-            if model.num_timesteps >= cell.n_timesteps:
-                return run, model
+        if n_steps_of(run / f"{file_stem(cell.env_id)}.zip") >= cell.n_timesteps:
+            return run, agent_at(run, "last").load()
     return None
 
 
@@ -146,9 +149,29 @@ def _settings(arguments: list[str]) -> set[str]:
     return {*takewhile(lambda word: not word.startswith("-"), after), *evaluations}
 
 
+class PatientLog(io.TextIOBase):
+    """
+    Writes as long as that is possible: a full disk stops no training.
+
+    :param file: to append to
+    """
+
+    def __init__(self, file: Path) -> None:
+        self._file = open(file, "ab", buffering=0)
+
+    def write(self, text: str) -> int:
+        with suppress(OSError):
+            self._file.write(text.encode(errors="backslashreplace"))
+        return len(text)
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
+
+
 @contextmanager
 def _logged(file: Path) -> Iterator[None]:
-    with open(file, "a", buffering=1) as log, redirect_stdout(log), redirect_stderr(log):
+    with PatientLog(file) as log, redirect_stdout(log), redirect_stderr(log):
         try:
             yield
         except Exception:

@@ -44,6 +44,19 @@ def test_a_training_shorter_than_the_time_between_evaluations_is_evaluated_at_it
     assert len(callback.returns) == 1
 
 
+def test_the_last_evaluation_is_written_at_the_end_if_it_could_not_be_before(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    callback = MetaEvalCallback(ENV_ID, eval_freq=60, n_eval_episodes=1, log_path=str(tmp_path), verbose=0)
+    write, broken = callback._write, iter((False, True))
+    callback._write = lambda *args: None if next(broken, False) else write(*args)  # type: ignore[method-assign]
+    tiny_pearl().learn(2 * ROLLOUT, callback=callback)
+    assert len(np.load(tmp_path / "evaluations.npz")["timesteps"]) == len(callback.returns) == 2
+
+
+def test_an_evaluation_without_episodes_is_refused_before_the_training() -> None:
+    with pytest.raises(ValueError, match="n_eval_episodes is 0, expected a whole number of at least 1"):
+        MetaEvalCallback(ENV_ID, n_eval_episodes=0)
+
+
 def test_meta_eval_is_on_validation_tasks_unless_told(tmp_path: Path) -> None:
     env, family = make_task_vec_env(ENV_ID, 2), PointRobotFamily()
     assert (MetaEvalCallback(env).tasks == family.validation_tasks).all()

@@ -11,7 +11,7 @@ import tables
 
 from sb3_htr.experiments import figures, report
 from sb3_htr.experiments.cell import Cell
-from sb3_htr.experiments.grid import EXPERIMENTS
+from sb3_htr.experiments.grid import EXPERIMENTS, Experiment, Variant
 from sb3_htr.experiments.protocol import EVAL_SEEDS, METRICS
 from sb3_htr.experiments.runner import LOGGED
 from sb3_htr.zoo.run.method import methods
@@ -115,11 +115,39 @@ def test_what_an_algorithm_does_not_tell_is_null(tmp_path: Path, monkeypatch: py
     json.dumps(summary, allow_nan=False)
 
 
+@pytest.mark.parametrize("damage", [b"", b"nothing that numpy knows", None])
+def test_damaged_results_are_named(damage: bytes | None, tmp_path: Path) -> None:
+    results = made_up(EXPERIMENTS["held_out_sector"].cells(1), tmp_path)
+    path = list(results.values())[-1]
+    path.write_bytes(path.read_bytes()[:1000] if damage is None else damage)
+    with pytest.raises(ValueError, match=rf"{path.name} is damaged, or no npz file\. Remove it: the same command then"):
+        report.check(results)
+
+
+def test_runs_of_one_variant_that_were_trained_differently_are_refused(tmp_path: Path) -> None:
+    results = made_up(EXPERIMENTS["held_out_sector"].cells(2), tmp_path)
+    for cell, path in results.items():
+        trained_by = json.dumps({"gamma": 0.9 if cell.seed == 1 else 0.5})
+        np.savez(path, **{**np.load(path), "hyperparams": trained_by})
+    with pytest.raises(ValueError, match=r"seed2\.npz was trained with other \['gamma'\] than .*seed1\.npz: has a YAML file"):
+        report.check(results)
+
+
+def test_a_variant_in_several_envs_is_several_curves(tmp_path: Path) -> None:
+    variants = tuple(Variant("htr-ser", env_kwargs={"goal_distance": distance}) for distance in (0.3, 1.0))
+    results = made_up(Experiment("two", "", "SparsePointRobot-v0", 100, variants, 2).cells(), tmp_path)
+    groups = figures.by_variant(results)
+    assert [*groups] == ["htr-ser {'goal_distance': 0.3}", "htr-ser {'goal_distance': 1.0}"]
+    assert [len(runs) for runs in groups.values()] == [2, 2]
+    with pytest.raises(ValueError, match="Several runs of three would be in the folder K_1-seed1: give the variants names"):
+        Experiment("three", "", "SparsePointRobot-v0", 100, (Variant("htr-ser", "K>1"), Variant("htr-ser", "K<1"))).cells()
+
+
 def test_a_result_of_an_older_version_is_named_before_anything_is_written(tmp_path: Path) -> None:
     results = made_up(EXPERIMENTS["held_out_sector"].cells(1), tmp_path)
     path = list(results.values())[-1]
     np.savez(path, **{key: value for key, value in np.load(path).items() if key != "solved"})
-    with pytest.raises(ValueError, match=rf"{path.name} is of another version, and lacks \['solved'\]: remove it"):
+    with pytest.raises(ValueError, match=rf"{path.name} lacks \['solved'\]\. It may be of another version\. Remove it"):
         report.write("", EXPERIMENTS["held_out_sector"], results, tmp_path / "results")
     changed = {replace(cell, n_timesteps=7): path for cell, path in results.items()}
     with pytest.raises(ValueError, match=r"has n_timesteps 150000, but held_out_sector/.* needs 7: move it away"):

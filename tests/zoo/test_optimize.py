@@ -55,6 +55,29 @@ def check_search(folder: Path, storage: str, capsys: pytest.CaptureFixture[str],
     return study
 
 
+def test_workers_with_one_command_do_not_draw_alike(quick: None, tmp_path: Path) -> None:
+    command = [
+        "optimize",
+        "--env",
+        ENV_ID,
+        "-n",
+        "240",
+        "--n-trials",
+        "1",
+        "-f",
+        str(tmp_path),
+        "--seed",
+        "1",
+        "--verbose",
+        "0",
+    ]
+    command += ["--storage", f"sqlite:///{tmp_path}/study.db", "--study-name", "one", *SMALL]
+    for _ in range(2):
+        assert main(command) == 0
+    rates = [trial.params["learning_rate"] for trial in optuna.load_study("one", f"sqlite:///{tmp_path}/study.db").trials]
+    assert len(set(rates)) == 2
+
+
 def test_a_study_in_sqlite(quick: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     study = check_search(tmp_path, f"sqlite:///{tmp_path}/study.db", capsys)
     # Two evaluations of each trial, the last of them is its value

@@ -97,6 +97,18 @@ def test_a_finished_run_says_so(unbroken: Path, capsys: pytest.CaptureFixture[st
     assert before == {path: path.stat().st_mtime_ns for path in unbroken.rglob("*")}
 
 
+def test_a_run_whose_model_could_not_be_written_is_not_finished(unbroken: Path, tmp_path: Path) -> None:
+    """There is a model, of when it was interrupted, and the last checkpoint."""
+    run = tmp_path / "run"
+    shutil.copytree(unbroken, run)
+    model = run / f"{ENV_ID}.zip"
+    whole = PEARL.load(model)
+    whole.num_timesteps = 240
+    whole.save(model)
+    assert main(["train", "--resume", str(run)]) == 0
+    assert PEARL.load(model).num_timesteps == 2400
+
+
 def test_training_further_is_as_if_it_had_been_planned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for folder, planned in (("at_once", "960"), ("further", "480")):
         arguments = [word if word != str(STEPS) else planned for word in TRAIN]

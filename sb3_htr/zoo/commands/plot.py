@@ -11,6 +11,7 @@ import torch as th
 
 from sb3_htr.adaptation.adaptation import Adaptation
 from sb3_htr.adaptation.evaluation import AdaptationRecord, run_adaptation
+from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.checks import get_task_family
 from sb3_htr.zoo.commands.arguments import add_adaptation_arguments, add_agent_arguments, chosen_agent, make_parser
 from sb3_htr.zoo.plots.adaptation import plot_adaptation_curve, plot_adaptation_paths, start_position
@@ -145,9 +146,14 @@ def learning_curve(label: str, agents: Sequence[TrainedAgent]) -> Curve | None:
     :raises ValueError: if they have no evaluation in common
     """
     files = [agent.folder / "evaluations.npz" for agent in agents if agent.folder is not None]
-    runs = [np.load(file) for file in files if file.exists()]
+    runs = [load_arrays(file, ("timesteps", "returns", "successes")) for file in files if file.exists()]
     if not runs:
         return None
+    if len({run["returns"].shape[2] for run in runs}) > 1:
+        raise ValueError(
+            f"The runs in {label} were evaluated after different numbers of adaptation episodes: train them with one "
+            "--eval-episodes."
+        )
     steps = reduce(np.intersect1d, [run["timesteps"] for run in runs])
     if len(steps) == 0:
         raise ValueError(f"The runs in {label} were never evaluated at the same env step: train them with one --eval-freq.")

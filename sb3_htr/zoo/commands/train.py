@@ -11,7 +11,7 @@ import gymnasium as gym
 
 from htr_envs.goal_env import find_hidden
 from sb3_htr.common.resume import n_steps_done
-from sb3_htr.zoo.run.agents import OF_TRAINING, RECORD, file_stem, find_run, read_record
+from sb3_htr.zoo.run.agents import OF_TRAINING, RECORD, file_stem, find_run, n_steps_of, read_record
 from sb3_htr.zoo.run.arguments import default_arguments, given_arguments
 from sb3_htr.zoo.run.manager import run_rl_zoo
 from sb3_htr.zoo.run.memory import keep_freed_memory
@@ -80,7 +80,8 @@ def main(argv: Sequence[str]) -> None:
         if not {*OF_TRAINING} <= record.keys():
             raise ValueError(f"{run} is no run of sb3-htr train, so there is nothing to go on with: give the folder of one.")
         planned = record["n_timesteps"] + further.n_timesteps
-        if (done := n_steps_done(run)) >= planned and (run / f"{file_stem(record['env_id'])}.zip").exists():
+        # An interrupted training leaves a model, too, and so does one that goes on
+        if (done := n_steps_done(run)) >= planned and n_steps_of(run / f"{file_stem(record['env_id'])}.zip") >= planned:
             print(f"{run} is finished, after {done:,} env steps. To train further: sb3-htr train --resume {run} -n STEPS")
             return
         given = [*given_arguments(record["arguments"]), "--seed", str(record["seed"]), "-n", str(planned)]

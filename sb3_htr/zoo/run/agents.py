@@ -145,6 +145,18 @@ def file_stem(env_id: str) -> str:
     return env_id.rpartition(":")[2].replace("/", "-")
 
 
+def n_steps_of(model: Path) -> int:
+    """
+    :param model: file
+    :return: env steps that it was trained for, 0 if there is no such file, or it does not say
+    """
+    try:
+        with zipfile.ZipFile(model) as archive:
+            return int(json.loads(archive.read("data"))["num_timesteps"])
+    except (OSError, zipfile.BadZipFile, KeyError, TypeError, ValueError):
+        return 0
+
+
 def read_record(path: Path, content: bytes | None = None) -> dict[str, Any]:
     """
     :param path: of the record, or of the file that it is in

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from sb3_htr.common.arrays import load_arrays
+
 # Of the way from the lowest evaluation to the last
 LEARNED = 0.95
 
@@ -18,8 +20,8 @@ def time_to_learned(run: Path) -> tuple[int, float] | None:
     """
     if not (run / "evaluations.npz").exists():
         return None
-    with np.load(run / "evaluations.npz") as evaluations:
-        steps, returns = evaluations["timesteps"], evaluations["returns"][:, :, -1].mean(axis=1)
+    evaluations = load_arrays(run / "evaluations.npz", ("timesteps", "returns"))
+    steps, returns = evaluations["timesteps"], evaluations["returns"][:, :, -1].mean(axis=1)
     is_learned = returns >= returns.min() + LEARNED * (returns[-1] - returns.min())
     first = steps[is_learned.argmax()]
     return int(first), float(seconds_at(run / "progress.csv", np.array([first]))[0])

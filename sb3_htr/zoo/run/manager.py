@@ -306,6 +306,12 @@ class MetaExperimentManager(ExperimentManager):
             print(f"Trial {trial.number} is pruned: {error}")
             raise optuna.TrialPruned from error
 
+    def _create_sampler(self, sampler_method: str) -> optuna.samplers.BaseSampler:
+        sampler = super()._create_sampler(sampler_method)
+        if self.storage is not None:  # workers of one study, with one command, must not draw alike
+            sampler.reseed_rng()
+        return sampler
+
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
         # As used: -n may have replaced the file's
         used = {**saved_hyperparams, "n_timesteps": self.n_timesteps}
