@@ -44,10 +44,16 @@ def test_a_training_shorter_than_the_time_between_evaluations_is_evaluated_at_it
     assert len(callback.returns) == 1
 
 
-def test_the_last_evaluation_is_written_at_the_end_if_it_could_not_be_before(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+def test_the_last_evaluation_is_written_at_the_end_if_it_could_not_be_before(
+    tiny_pearl: MakePEARL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     callback = MetaEvalCallback(ENV_ID, eval_freq=60, n_eval_episodes=1, log_path=str(tmp_path), verbose=0)
     write, broken = callback._write, iter((False, True))
-    callback._write = lambda *args: None if next(broken, False) else write(*args)  # type: ignore[method-assign]
+
+    def write_if_possible(*args: Any) -> bool:
+        return False if next(broken, False) else write(*args)
+
+    monkeypatch.setattr(callback, "_write", write_if_possible)
     tiny_pearl().learn(2 * ROLLOUT, callback=callback)
     assert len(np.load(tmp_path / "evaluations.npz")["timesteps"]) == len(callback.returns) == 2
 

@@ -56,25 +56,12 @@ def check_search(folder: Path, storage: str, capsys: pytest.CaptureFixture[str],
 
 
 def test_workers_with_one_command_do_not_draw_alike(quick: None, tmp_path: Path) -> None:
-    command = [
-        "optimize",
-        "--env",
-        ENV_ID,
-        "-n",
-        "240",
-        "--n-trials",
-        "1",
-        "-f",
-        str(tmp_path),
-        "--seed",
-        "1",
-        "--verbose",
-        "0",
-    ]
-    command += ["--storage", f"sqlite:///{tmp_path}/study.db", "--study-name", "one", *SMALL]
+    storage = f"sqlite:///{tmp_path}/study.db"
+    command = ["optimize", "--env", ENV_ID, "-n", "240", "--n-trials", "1", "-f", str(tmp_path), "--seed", "1"]
+    command += ["--storage", storage, "--study-name", "one", "--verbose", "0", *SMALL]
     for _ in range(2):
         assert main(command) == 0
-    rates = [trial.params["learning_rate"] for trial in optuna.load_study("one", f"sqlite:///{tmp_path}/study.db").trials]
+    rates = [trial.params["learning_rate"] for trial in optuna.load_study(study_name="one", storage=storage).trials]
     assert len(set(rates)) == 2
 
 
