@@ -1,6 +1,7 @@
 """Checkpoints from which a training goes on as if it had never stopped."""
 
 import shutil
+import time
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -160,6 +161,10 @@ class CheckpointCallback(BaseCallback):
                 writer = type(output.writer)(log_dir=folder, purge_step=self.num_timesteps + 1)
                 output.writer.close()
                 output.writer = writer
+            if "elapsed_ns" in self._pending:  # which older versions have not saved
+                # What is logged goes on, too
+                self.model.start_time -= self._pending["elapsed_ns"]
+                self.model._num_timesteps_at_start = self._pending["num_timesteps_at_start"]
             self._pending = None
             return
         beyond = [folder for folder in checkpoints(self.run) if int(folder.name.split("_")[0]) > self.num_timesteps]
@@ -219,6 +224,8 @@ class CheckpointCallback(BaseCallback):
                 {"n_calls": callback.n_calls, "state": callback.state_dict() if isinstance(callback, HasState) else None}
                 for callback in (self, *self.companions)
             ],
+            "elapsed_ns": time.time_ns() - int(self.model.start_time),
+            "num_timesteps_at_start": self.model._num_timesteps_at_start,
             "monitor_files": self._monitor_files(),
             "tensorboard_folders": [str(output.writer.log_dir) for output in self._tensorboards()],
         }

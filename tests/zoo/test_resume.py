@@ -56,6 +56,8 @@ def assert_same_run(run: Path, unbroken: Path) -> None:
     for name in progress[0].dtype.names:
         if name not in ("time/fps", "time/time_elapsed"):
             np.testing.assert_array_equal(progress[0][name], progress[1][name], err_msg=name)
+    seconds = progress[0]["time/time_elapsed"]
+    assert (np.diff(seconds[~np.isnan(seconds)]) >= 0).all(), "the clock goes on"
     # The episodes of all monitor files together, each once
     episodes = [load_results(str(r)).sort_values("t") for r in (run, unbroken)]
     assert len(episodes[0]) == len(episodes[1]) == STEPS // 20

@@ -31,9 +31,9 @@ def seconds_at(log: Path, steps: np.ndarray) -> np.ndarray:
     """
     :param log: ``progress.csv`` of a training
     :param steps: (n,) env steps
-    :return: (n,) seconds of training until then, between the rollouts that were logged around it. A training that went on from
-        a checkpoint counts from 0 again, which is put right; what was trained after the checkpoint and lost does not count.
-        NaN where nothing tells them
+    :return: (n,) seconds of training until then, between the rollouts that were logged around it; what was trained after a
+        checkpoint and lost does not count. In logs of older versions, a training that went on counts from 0 again, which is
+        put right where it can be seen. NaN where nothing tells them
     """
     if not log.exists():
         return np.full(len(steps), np.nan)
