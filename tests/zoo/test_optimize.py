@@ -55,13 +55,16 @@ def check_search(folder: Path, storage: str, capsys: pytest.CaptureFixture[str],
     return study
 
 
-def test_workers_with_one_command_do_not_draw_alike(quick: None, tmp_path: Path) -> None:
+def test_workers_with_one_command_do_not_draw_alike(quick: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One that was killed is told of."""
     storage = f"sqlite:///{tmp_path}/study.db"
+    optuna.create_study(study_name="one", storage=storage).ask()
     command = ["optimize", "--env", ENV_ID, "-n", "240", "--n-trials", "1", "-f", str(tmp_path), "--seed", "1"]
     command += ["--storage", storage, "--study-name", "one", "--verbose", "0", *SMALL]
     for _ in range(2):
         assert main(command) == 0
-    rates = [trial.params["learning_rate"] for trial in optuna.load_study(study_name="one", storage=storage).trials]
+    assert "1 trials are running, or their workers were killed" in capsys.readouterr().out
+    rates = [trial.params["learning_rate"] for trial in optuna.load_study(study_name="one", storage=storage).trials[1:]]
     assert len(set(rates)) == 2
 
 
