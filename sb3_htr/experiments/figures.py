@@ -83,7 +83,7 @@ def learning(results: Results, path: Path) -> None:
 
 def race(results: Results, path: Path) -> None:
     """
-    Validation tasks solved during meta-training, over env steps and over the minutes that these and the updates took.
+    Validation tasks solved during meta-training, over env steps and over the minutes that these and the updates took, those of the median run.
 
     :param results: raw results of the cells
     :param path: picture to write
@@ -94,7 +94,7 @@ def race(results: Results, path: Path) -> None:
         solved = np.stack([100 * raw["solved"].mean(axis=1) for _, raw in runs])
         name = f"{label(variant, runs, results)}, {runs[0][0].evaluations[0].explorer}"
         band(left, runs[0][1]["timesteps"] / 1000, solved, colour, "-", name)
-        band(right, np.mean([raw["elapsed_s"] for _, raw in runs], axis=0) / 60, solved, colour, "-", f"_{name}")
+        band(right, np.median([raw["elapsed_s"] for _, raw in runs], axis=0) / 60, solved, colour, "-", f"_{name}")
     for axes in (left, right):
         axes.set_xscale("log")
         axes.xaxis.set_major_formatter("{x:g}")
