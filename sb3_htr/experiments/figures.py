@@ -83,7 +83,8 @@ def learning(results: Results, path: Path) -> None:
 
 def race(results: Results, path: Path) -> None:
     """
-    Validation tasks solved during meta-training, over env steps and over the minutes that these and the updates took, those of the median run.
+    Validation tasks solved during meta-training, over env steps and over the minutes that these and the updates took in the
+    median run.
 
     :param results: raw results of the cells
     :param path: picture to write
