@@ -1,11 +1,7 @@
 """One cell, in whatever process an executor calls it: claimed, trained from where it was, and evaluated."""
 
-import io
 import json
 import platform
-import traceback
-from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import Any
@@ -19,6 +15,7 @@ from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.resume import checkpoints
 from sb3_htr.common.versions import commit, named, processor
 from sb3_htr.experiments.cell import Cell
+from sb3_htr.experiments.log import logged
 from sb3_htr.experiments.protocol import evaluate
 from sb3_htr.zoo.commands import train
 from sb3_htr.zoo.run.agents import RECORD, agent_at, file_stem, find_runs, n_steps_of, read_record
@@ -73,7 +70,7 @@ def run_cell(cell: Cell, runs: Path) -> bool:
             if result.exists():
                 cell.check_result(result)
             else:
-                with _logged(folder / "log.txt"):
+                with logged(folder / "log.txt"):
                     arrays = _train_and_evaluate(cell, folder)
                 with atomic_path(result) as path:
                     np.savez_compressed(path, **arrays)
@@ -147,33 +144,3 @@ def _settings(arguments: list[str]) -> set[str]:
     options = {**ALWAYS, **dict(pairwise(arguments))}
     evaluations = {f"{option} {options.get(option)}" for option in ("--eval-episodes", "--eval-freq")}
     return {*takewhile(lambda word: not word.startswith("-"), after), *evaluations}
-
-
-class PatientLog(io.TextIOBase):
-    """
-    Writes as long as that is possible: a full disk stops no training.
-
-    :param file: to append to
-    """
-
-    def __init__(self, file: Path) -> None:
-        self._file = open(file, "ab", buffering=0)
-
-    def write(self, text: str) -> int:
-        with suppress(OSError):
-            self._file.write(text.encode(errors="backslashreplace"))
-        return len(text)
-
-    def close(self) -> None:
-        self._file.close()
-        super().close()
-
-
-@contextmanager
-def _logged(file: Path) -> Iterator[None]:
-    with PatientLog(file) as log, redirect_stdout(log), redirect_stderr(log):
-        try:
-            yield
-        except Exception:
-            traceback.print_exc()
-            raise

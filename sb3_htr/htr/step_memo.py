@@ -28,6 +28,7 @@ class StepMemo:
         :param rows: int, any shape, rows of :attr:`EpisodeStore.rows` that hold data
         :return: int8, same shape, what the function says of them
         """
+        # Another store, or one that was loaded with fewer slots
         if store is not self._store or len(store.written) < len(self._written):
             self._store, self._n_written = store, 0
             self._known, self._written = np.zeros((0, store.episode_length), dtype=np.int8), np.zeros(0, dtype=np.int64)

@@ -160,7 +160,6 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         given = {name: getattr(self, name) for name in BY_HORIZON}
         vars(self).update(complete(given, max_episode_steps, self.n_tasks_per_rollout))
         if self.env is not None:
-            self.max_episode_steps = max_episode_steps
             rollout = self.n_tasks_per_rollout * self.n_episodes_per_task * max_episode_steps
             if rollout > MAX_STEPS_PER_UPDATE * self.gradient_steps:
                 warnings.warn(
@@ -180,6 +179,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
     def _setup_replay(self, env: VecEnv) -> None:
         checks.check_rewards(env)
         family = checks.get_task_family(env)
+        self.max_episode_steps = checks.get_max_episode_steps(env)
         buffer_class = cast(type[MultiTaskReplayBuffer], self.replay_buffer_class)
         self.replay_buffer = buffer_class(
             self.buffer_size,
@@ -189,7 +189,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
             n_envs=self.n_envs,
             seed=self.seed,
             task_family=family,
-            max_episode_steps=checks.get_max_episode_steps(env),
+            max_episode_steps=self.max_episode_steps,
             **self.replay_buffer_kwargs,
         )
         self.task_bank = TaskBank(family, self.replay_buffer.transitions, self.context_size, self.seed)

@@ -25,8 +25,8 @@ MAX_CONTEXT = 2**14
 EXPLORERS = ("explorer", "train_explorer")
 # Of an object, SB3 writes its plain attributes beside its type and its pickle
 TYPE, PICKLED = ":type:", ":serialized:"
-# How many transitions a replay buffer may have room for: it takes memory as they come, but for an index of its episodes
-MAX_BUFFER = 10**8
+# How many transitions a replay buffer may have room for: it takes memory as they come, but for 8 bytes an episode
+MAX_BUFFER = 2 * 10**7
 # Arguments of PEARL that are numbers and take no memory, those that may be words, and counters
 NUMBERS = (
     *("learning_rate", "learning_starts", "batch_size", "tau", "gamma", "gradient_steps", "ent_coef", "target_entropy"),

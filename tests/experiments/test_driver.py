@@ -56,7 +56,7 @@ def test_several_drivers_share_the_cells_and_none_runs_twice(
     trains: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Threads of one process share what is printed to
-    monkeypatch.setattr("sb3_htr.experiments.runner._logged", nullcontext)
+    monkeypatch.setattr("sb3_htr.experiments.runner.logged", nullcontext)
     trained = trains(lambda cell, folder: time.sleep(0.05))
     drivers = [threading.Thread(target=Driver(CELLS, tmp_path, ThreadPoolExecutor(2)).run) for _ in range(3)]
     for thread in drivers:

@@ -32,13 +32,15 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
 from sb3_htr.common.atomic import WRITE_ERRORS, atomic_path, reason
-from sb3_htr.common.checks import check_keywords, check_numbers
+from sb3_htr.common.checks import check_keywords, check_numbers, keywords_of
 from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.resume import CheckpointCallback, checkpoints, cut_monitor_files, load_latest
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.common.versions import commit, versions
+from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.pearl.pearl import PEARL
+from sb3_htr.pearl.policies import PEARLPolicy
 from sb3_htr.pearl.untrusted import load_untrusted
 from sb3_htr.zoo.run.agents import RECORD, read_record
 from sb3_htr.zoo.run.algorithm import Algorithm
@@ -50,11 +52,6 @@ from sb3_htr.zoo.run.trust import PACKAGES, plain_settings, refuse
 
 # What a YAML file may have beside the arguments of the algorithm
 ZOO_SETTINGS = ("n_envs", "n_timesteps", "env_wrapper", "vec_env_wrapper", "callback", "env_kwargs")
-# What is often given beside these dicts in place of in them
-SETTINGS_WITHIN = {
-    "replay_buffer_kwargs": {"relabel_probability", "relabeller", "rl_reward_type", "context_episodes"},
-    "policy_kwargs": {"latent_dim", "net_arch", "encoder_arch", "normalize_observations"},
-}
 # Tasks that an evaluation adapts to side by side
 N_EVAL_ENVS = 20
 
@@ -143,8 +140,10 @@ class MetaExperimentManager(ExperimentManager):
                 "normalizes observations itself (normalize_observations of policy_kwargs)."
             )
         model_class = self.method.algorithm.model_class()
-        for name in ("replay_buffer_kwargs", "policy_kwargs"):
-            if model_class is PEARL and (misplaced := sorted(SETTINGS_WITHIN[name] & hyperparams.keys())):
+        own = {*keywords_of(model_class), *ZOO_SETTINGS}
+        within = {"replay_buffer_kwargs": MultiTaskReplayBuffer, "policy_kwargs": PEARLPolicy} if model_class is PEARL else {}
+        for name, owner in within.items():
+            if misplaced := sorted(hyperparams.keys() & keywords_of(owner) - own):
                 raise ValueError(f"{misplaced[0]} is a setting within {name}: -params \"{name}:{{'{misplaced[0]}':...}}\".")
         check_keywords(model_class.__name__, hyperparams, model_class, also=ZOO_SETTINGS)
         check_numbers(n_envs=(hyperparams.get("n_envs", 1), 1, float("inf")))
