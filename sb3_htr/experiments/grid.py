@@ -66,6 +66,7 @@ class Experiment:
     :param models_of: name of the experiment whose runs are tested; by default it trains its own
     :param figure: draws the results of all cells into a file
     :param n_episodes: adaptation episodes on a task, in training's evaluations and in those of the final models
+    :param conf: file of hyperparameters, that of each method's algorithm by default
     """
 
     name: str
@@ -79,6 +80,7 @@ class Experiment:
     models_of: str = ""
     figure: Callable[[dict[Cell, Path], Path], None] = figures.learning
     n_episodes: int = 20
+    conf: str = ""
 
     def cells(self, seeds: int | None = None, scale: float = 1.0) -> list[Cell]:
         """
@@ -101,6 +103,7 @@ class Experiment:
                 settings=variant.settings,
                 env_kwargs=variant.env_kwargs,
                 evaluations=self._evaluations_of(variant.method),
+                conf=self.conf,
             )
             for seed in range(1, (seeds or self.seeds) + 1)
             for variant in self.variants
@@ -168,6 +171,16 @@ ALL = (
         POINT,
         150_000,
         tuple(Variant(method, env_kwargs={"held_out": [70.0, 110.0]}) for method in ("htr-ser", "pearl-dense")),
+    ),
+    Experiment(
+        "paper_profile",
+        "The settings of the papers, and their protocol.",
+        POINT,
+        1_000_000,
+        (Variant("htr-ser-prior"),),
+        eval_freq=50_000,
+        evaluations=by(("prior", "learned-prior", "belief")),
+        conf="pearl_paper.yml",
     ),
     Experiment(
         "ablation",

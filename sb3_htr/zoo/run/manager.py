@@ -48,6 +48,7 @@ from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback, ProgressCallback
 from sb3_htr.zoo.run.folder import claim, lock
 from sb3_htr.zoo.run.method import DEFAULT, PEARLMethod, get_method, merged, names_of
 from sb3_htr.zoo.run.search_space import convert_pearl_params, sample_pearl_params
+from sb3_htr.zoo.run.shipped import find_hyperparams
 from sb3_htr.zoo.run.trust import PACKAGES, plain_settings, refuse
 
 # What a YAML file may have beside the arguments of the algorithm
@@ -65,6 +66,7 @@ class MetaExperimentManager(ExperimentManager):
         self, *args: Any, method: str | None = None, resumed: Path | None = None, trust: bool = False, **kwargs: Any
     ) -> None:
         super().__init__(*args, **kwargs)
+        self.config = find_hyperparams(self.config)
         self.trust = trust
         self._method_name = method
         self._unique = kwargs.get("uuid_str", "")

@@ -20,3 +20,11 @@ def hyperparams_file(name: str) -> Path:
     :return: its path
     """
     return shipped("hyperparams") / name
+
+
+def find_hyperparams(name: str) -> str:
+    """
+    :param name: of a file, as a user gives it
+    :return: its path, one's own or, if there is none, that of the package's file of this name; a module stays as it is
+    """
+    return name if Path(name).exists() or not hyperparams_file(name).is_file() else str(hyperparams_file(name))
