@@ -20,6 +20,7 @@ from sb3_htr import PEARL
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.zoo.cli import main
+from sb3_htr.zoo.run.agents import RECORD, read_record
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback
 from sb3_htr.zoo.run.manager import MetaExperimentManager
 from sb3_htr.zoo.run.memory import keep_freed_memory
@@ -96,6 +97,18 @@ def test_env_kwargs_of_the_yaml_reach_the_evaluation(tmp_path: Path) -> None:
     # Every goal disc of this distance holds the start, so that all adaptations find it at once
     evaluations = np.load(run_folder(tmp_path) / "evaluations.npz")
     assert evaluations["successes"].all(axis=(0, 1))[0]
+
+
+def test_the_papers_settings_are_found_by_name_wherever_one_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file of one's own of the same name comes first."""
+    monkeypatch.chdir(tmp_path)
+    arguments = ["train", "--env", ENV_ID, "-conf", "pearl_paper.yml", "--eval-freq", "-1", "--verbose", "0", "-n", "8"]
+    tiny = ["n_envs:2", "n_tasks_per_rollout:2", "n_episodes_per_task:1", "gradient_steps:1", "learning_starts:0"]
+    assert main([*arguments, "-f", "theirs", "-params", *tiny, "meta_batch_size:2"]) == 0
+    assert read_record(run_folder(Path("theirs"), "htr-ser-prior") / RECORD)["hyperparams"]["tau"] == 0.005
+    (tmp_path / "pearl_paper.yml").write_text(yaml.safe_dump({ENV_ID: {"policy": "MlpPolicy", "n_timesteps": 8, "tau": 0.1}}))
+    assert main([*arguments, "-f", "own", "-params", *tiny, "meta_batch_size:2"]) == 0
+    assert read_record(run_folder(Path("own")) / RECORD)["hyperparams"]["tau"] == 0.1
 
 
 def test_a_run_logs_its_progress_and_its_schedule_needs_no_zoo(tmp_path: Path) -> None:
