@@ -88,6 +88,7 @@ SETTINGS: dict[str, Any] = {
     "batch_size": 96,
     "context_size": 200,
     "gamma": 0.99,
+    "n_steps": 1,
     "ent_coef": 0.2,
     "kl_coef": 0.01,
     "replay_buffer_kwargs": {"relabel_probability": 0.0, "context_episodes": 4},

@@ -15,6 +15,7 @@ from sb3_htr.common.settings import make
 from sb3_htr.common.task_reward import ROUNDING, task_reward
 from sb3_htr.common.type_aliases import Context, MultiTaskSamples, RewardLabels, TaskFamily
 from sb3_htr.htr.episode_store import EpisodeStore
+from sb3_htr.htr.n_step import n_step_returns, steps_ahead
 from sb3_htr.htr.relabel import RELABELLERS, Relabeller
 from sb3_htr.htr.reward_hook import check_reward_hook
 from sb3_htr.htr.transitions import Transitions
@@ -327,7 +328,14 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         self.discard_open_episodes()
 
     def sample(  # type: ignore[override]
-        self, batch_size: int, *, meta_batch_size: int = 16, context_size: int = 64, n_labelled: int = 0
+        self,
+        batch_size: int,
+        *,
+        meta_batch_size: int = 16,
+        context_size: int = 64,
+        n_labelled: int = 0,
+        n_steps: int = 1,
+        gamma: float = 0.98,
     ) -> MultiTaskSamples:
         """
         Draw a meta-batch: tasks with replacement (as PEARL's reference does), and for each of them context and RL batch.
@@ -340,6 +348,8 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         :param meta_batch_size: number of tasks, M
         :param context_size: transitions per task for the context, at most
         :param n_labelled: transitions that are rewarded under all tasks of the meta-batch, at most
+        :param n_steps: steps of each transition of the RL batch, under one task, to the end of the episode at most
+        :param gamma: discount of a step
         :return: the meta-batch
         :raises ValueError: if no episode is complete yet, or the reward hook returns NaN or infinity
         """
@@ -359,46 +369,64 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         batch, n_batch = spread(self._rng, batch_source, batch_size)
         virtual = np.concatenate([context, batch])
         task_of_row = np.concatenate([np.repeat(np.arange(meta_batch_size), n) for n in (n_context, n_batch)])
-        if hindsight is None:
-            rows = self.episodes.take(virtual)
-        else:
-            is_hindsight = relabelled[task_of_row]
-            of_store = is_hindsight.copy()
+        store, of_store = self.episodes, relabelled[task_of_row]
+        if hindsight is not None:
+            store = hindsight.store
             if hindsight.elsewhere:
-                anywhere = len(context) + np.flatnonzero(is_hindsight[len(context) :])
+                anywhere = len(context) + np.flatnonzero(of_store[len(context) :])
                 anywhere = anywhere[self.relabel_rng.random(len(anywhere)) < hindsight.elsewhere]
                 virtual[anywhere] = self.relabel_rng.integers(len(index.rows), size=len(anywhere))
                 of_store[anywhere] = False
-            rows = self.take(virtual, of_store, hindsight.store)
-            if not hindsight.is_relabelled:
-                where = np.flatnonzero(is_hindsight)
-                self.write_rewards(rows, where, reward_task[task_of_row[where]])
+        # From here on, n_steps rows for each of the RL batch
+        rl = slice(len(context), None)
+        ahead, n_ahead = self._steps_ahead(virtual[rl], of_store[rl], store, n_steps)
+        times = np.repeat([1, n_steps], [len(context), len(batch)])
+        of_task = np.repeat(task_of_row, times)
+        rows = self.take(np.append(context, ahead), np.repeat(of_store, times), store)
+        if hindsight is not None and not hindsight.is_relabelled:
+            where = np.flatnonzero(relabelled[of_task])
+            self.write_rewards(rows, where, reward_task[of_task[where]])
         if self.rl_reward_type == "dense":
             where = np.arange(len(context), len(rows))
-            self.write_rewards(rows, where, reward_task[task_of_row[where]], "dense")
+            self.write_rewards(rows, where, reward_task[of_task[where]], "dense")
         columns = self.transitions
-        labels = self._label(rows[len(context) :], rows[: len(context)], n_context, reward_task, n_labelled)
-        data = self.to_torch(rows, copy=False)
-        context_rows, rl_rows = data[: len(context)], data[len(context) :]
-        beside = rows[len(context) :, columns.reward] - rows[len(context) :, columns.task_free_reward]
+        context_rows, steps = rows[: len(context)], rows[rl].reshape(len(batch), n_steps, -1)
+        first, last = steps[:, 0], steps[:, -1]
+        returns, discounts = n_step_returns(steps[..., columns.reward], n_ahead, gamma)
+        beside = first[:, columns.reward] - first[:, columns.task_free_reward]
         return MultiTaskSamples(
             context=Context(
-                observations=context_rows[:, columns.observation],
-                actions=context_rows[:, columns.action],
-                rewards=context_rows[:, columns.reward],
-                lengths=self.to_torch(n_context, copy=False),
+                observations=self._tensor(context_rows[:, columns.observation]),
+                actions=self._tensor(context_rows[:, columns.action]),
+                rewards=self._tensor(context_rows[:, columns.reward]),
+                lengths=self._tensor(n_context),
             ),
-            observations=rl_rows[:, columns.observation],
-            actions=rl_rows[:, columns.action],
-            next_observations=rl_rows[:, columns.next_observation],
-            rewards=rl_rows[:, columns.reward],
-            dones=rl_rows[:, columns.done],
-            lengths=self.to_torch(n_batch, copy=False),
+            observations=self._tensor(first[:, columns.observation]),
+            actions=self._tensor(first[:, columns.action]),
+            next_observations=self._tensor(last[:, columns.next_observation]),
+            rewards=self._tensor(returns),
+            dones=self._tensor(last[:, columns.done]),
+            discounts=self._tensor(discounts),
+            lengths=self._tensor(n_batch),
             task_ids=tasks,
             relabelled=relabelled,
             unrewarded=np.logical_and.reduceat(np.abs(beside) <= ROUNDING, np.cumsum(n_batch) - n_batch),
-            labels=labels,
+            labels=self._label(first, context_rows, n_context, reward_task, n_labelled),
         )
+
+    def _tensor(self, array: np.ndarray) -> th.Tensor:
+        return self.to_torch(array, copy=False)
+
+    def _steps_ahead(
+        self, virtual: np.ndarray, of_store: np.ndarray, store: EpisodeStore, n_steps: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """See :func:`sb3_htr.htr.n_step.steps_ahead`; each row may be of either store, see :meth:`take`."""
+        if store is self.episodes:
+            return steps_ahead(store.index(), virtual, n_steps)
+        ahead, n = np.empty((len(virtual), n_steps), dtype=np.int64), np.empty(len(virtual), dtype=np.int64)
+        for of_this, episodes in ((~of_store, self.episodes), (of_store, store)):
+            ahead[of_this], n[of_this] = steps_ahead(episodes.index(), virtual[of_this], n_steps)
+        return ahead, n
 
     def _label(
         self, rows: np.ndarray, context: np.ndarray, n_context: np.ndarray, tasks: np.ndarray, n_labelled: int
@@ -412,8 +440,13 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         reward = task_reward(self.task_family.compute_reward(traj, tasks), traj.task_free_reward)
         rewarded = task_reward(context[:, columns.reward], context[:, columns.task_free_reward]) > 0
         inferred = np.logical_or.reduceat(rewarded, np.cumsum(n_context) - n_context)
-        labels = (chosen, np.ascontiguousarray(reward.T, dtype=np.float32), traj.task_free_reward, inferred.astype(np.float32))
-        return RewardLabels(*(self.to_torch(x, copy=False) for x in labels))
+        return RewardLabels(
+            rows=self._tensor(chosen),
+            next_observations=self._tensor(traj.next_observations),
+            reward=self._tensor(np.ascontiguousarray(reward.T, dtype=np.float32)),
+            task_free=self._tensor(traj.task_free_reward),
+            inferred=self._tensor(inferred.astype(np.float32)),
+        )
 
     def take(self, virtual: np.ndarray, of_store: np.ndarray, store: EpisodeStore) -> np.ndarray:
         """

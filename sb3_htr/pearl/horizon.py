@@ -10,13 +10,15 @@ STEPS_PER_TASK = 400
 STEPS_PER_UPDATE = 20
 # The discount reaches as far as the time limit, up to here
 MAX_GAMMA = 0.98
+# A return counts the rewards of one step for so many of an episode, up to so many steps
+STEPS_PER_RETURN, MAX_N_STEPS = 40, 10
 # Transitions per task in an update: an episode, up to so many
 MAX_TRANSITIONS = 24
 # Of a training: by measurement, the Point Robot (20 steps an episode) has learnt after 40,000, the rest is for the last digit;
 # Wheeled robot and ant (200) need 3,000 episodes
 MIN_TIMESTEPS, N_EPISODES = 150_000, 3_000
 # Arguments of PEARL
-BY_HORIZON = ("gamma", "n_episodes_per_task", "learning_starts", "gradient_steps", "batch_size", "context_size")
+BY_HORIZON = ("gamma", "n_steps", "n_episodes_per_task", "learning_starts", "gradient_steps", "batch_size", "context_size")
 
 
 def settings_for(max_episode_steps: int, n_tasks_per_rollout: int, n_episodes_per_task: int | None = None) -> dict[str, Any]:
@@ -34,6 +36,7 @@ def settings_for(max_episode_steps: int, n_tasks_per_rollout: int, n_episodes_pe
     n_transitions = min(max_episode_steps, MAX_TRANSITIONS)
     return {
         "gamma": min(max(1 - 2 / max_episode_steps, 0.0), MAX_GAMMA),
+        "n_steps": min(max(max_episode_steps // STEPS_PER_RETURN, 1), MAX_N_STEPS),
         "n_episodes_per_task": n_episodes,
         # SB3 learns beyond so many steps, and this is after the first rollout
         "learning_starts": rollout - 1,

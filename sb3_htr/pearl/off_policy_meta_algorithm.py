@@ -60,7 +60,9 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
     :param gradient_steps: updates after each rollout
     :param batch_size: transitions per task for actor and critics, at most
     :param context_size: transitions per task for the context, at most
-    :param gamma: discount. Which of these six are None follow from the time limit: :func:`sb3_htr.pearl.horizon.settings_for`
+    :param gamma: discount
+    :param n_steps: steps of a return before a value is asked for. Which of these seven are None follow from the time limit:
+        :func:`sb3_htr.pearl.horizon.settings_for`
     :param explorer: chooses z at meta-test: an explorer, its name, or its name and settings
     :param train_explorer: the same for rollouts
     :param replay_buffer_class: a MultiTaskReplayBuffer
@@ -86,6 +88,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         batch_size: int | None,
         context_size: int | None,
         gamma: float | None,
+        n_steps: int | None,
         explorer: Explorer | dict[str, Any] | str,
         train_explorer: Explorer | dict[str, Any] | str,
         replay_buffer_class: type[MultiTaskReplayBuffer] | None,
@@ -121,6 +124,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         self.policy_kwargs.pop("use_sde")
         checks.check_keywords("policy_kwargs", self.policy_kwargs, self.policy_class)
         self.context_size: int = context_size  # type: ignore[assignment]
+        self.n_steps: int = n_steps  # type: ignore[assignment]
         self.n_tasks_per_rollout = n_tasks_per_rollout
         self.n_episodes_per_task: int = n_episodes_per_task  # type: ignore[assignment]
         #: Of training; None if the model has had no env yet
@@ -145,7 +149,10 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         else:
             self._check_rollouts()
             self._setup_replay(self.env)
-            super()._setup_model()
+            with warnings.catch_warnings():
+                # SB3 does not know that this buffer has them
+                warnings.filterwarnings("ignore", "`n_steps=")
+                super()._setup_model()
         self.knowledge = LatentKnowledge(self.policy.latent_dim).to(self.device)
         self._introduce_policy()
 

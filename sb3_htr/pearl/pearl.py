@@ -32,7 +32,7 @@ class PEARL(OffPolicyMetaAlgorithm):
     critics instead of a value network.
 
     One rollout collects whole episodes on ``n_tasks_per_rollout`` training tasks, as many at once as there are envs; then
-    follow ``gradient_steps`` updates. The defaults are the fast profile for two CPU cores, found by measurement; six of them
+    follow ``gradient_steps`` updates. The defaults are the fast profile for two CPU cores, found by measurement; seven of them
     follow from the time limit of the env (:func:`sb3_htr.pearl.horizon.settings_for`). The papers' values are in
     ``hyperparams/pearl_paper.yml`` and given here where they differ.
 
@@ -48,6 +48,9 @@ class PEARL(OffPolicyMetaAlgorithm):
     :param tau: soft update of the target critics, in (0, 1] (PEARL's reference: 0.005)
     :param gamma: discount, 1 - 2 / T for T steps of an episode by default, 0.98 at most (PEARL's reference for the sparse
         point robot: 0.9, which it is there)
+    :param n_steps: steps whose rewards a return counts before the critics' value is asked for. Values reach further back with
+        each update, but what was done in these steps counts, whatever the task that it was done for. By default one for every
+        40 steps of an episode, from 1 to 10 (PEARL's reference: 1)
     :param gradient_steps: updates after each rollout; by default one for 20 env steps of a rollout whose episodes last to the
         time limit, and so more where they end early (PEARL's reference: 1000)
     :param replay_buffer_class: a MultiTaskReplayBuffer
@@ -99,6 +102,7 @@ class PEARL(OffPolicyMetaAlgorithm):
         tau: float = 0.01,
         gamma: float | None = None,
         *,
+        n_steps: int | None = None,
         gradient_steps: int | None = None,
         replay_buffer_class: type[MultiTaskReplayBuffer] | None = None,
         replay_buffer_kwargs: dict[str, Any] | None = None,
@@ -131,6 +135,7 @@ class PEARL(OffPolicyMetaAlgorithm):
             batch_size=batch_size,
             tau=tau,
             gamma=gamma,
+            n_steps=n_steps,
             gradient_steps=gradient_steps,
             replay_buffer_class=replay_buffer_class,
             replay_buffer_kwargs=replay_buffer_kwargs,
@@ -205,8 +210,14 @@ class PEARL(OffPolicyMetaAlgorithm):
     def _update(self, batch_size: int) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """One update of all networks. Posterior means (M, latent_dim), and what to log."""
         assert self.replay_buffer is not None
-        sizes = {"meta_batch_size": self.meta_batch_size, "context_size": self.context_size, "n_labelled": N_LABELLED}
-        data = self.replay_buffer.sample(batch_size, **sizes)
+        data = self.replay_buffer.sample(
+            batch_size,
+            meta_batch_size=self.meta_batch_size,
+            context_size=self.context_size,
+            n_labelled=N_LABELLED,
+            n_steps=self.n_steps,
+            gamma=self.gamma,
+        )
         # Each task has the same weight in a mean over transitions
         weight = (1.0 / (self.meta_batch_size * data.lengths)).repeat_interleave(data.lengths, output_size=len(data.rewards))
         # One backward pass through the encoder: it learns from the critics' errors, the KL term and the reward model's errors
@@ -221,7 +232,7 @@ class PEARL(OffPolicyMetaAlgorithm):
             next_obs_z = th.cat([next_obs, z_rows], dim=1)
             next_actions, next_log_prob = self.policy.sample_actions(next_obs_z)
             next_q = self.critic_target(next_obs_z, next_actions).amin(dim=0) - ent_coef * next_log_prob
-            target_q = data.rewards + (1 - data.dones) * self.gamma * next_q
+            target_q = data.rewards + (1 - data.dones) * data.discounts * next_q
         q = self.critic(obs_z, data.actions)
         critic_loss = ((q - target_q).square() * weight).sum()
         learning = [self.critic.optimizer, self.encoder.optimizer]
@@ -230,7 +241,7 @@ class PEARL(OffPolicyMetaAlgorithm):
             learning.append(self.reward_model.optimizer)
             # The values of z, of which the gradient is weighted
             weighted_z = th.lerp(z.detach(), z, self.reward_coef)
-            reward_losses = self._reward_losses(data.labels, obs, data.actions, next_obs, weighted_z)
+            reward_losses = self._reward_losses(data.labels, obs, data.actions, weighted_z)
             loss = loss + sum(reward_losses.values())
         for optimizer in learning:
             optimizer.zero_grad()
@@ -273,11 +284,9 @@ class PEARL(OffPolicyMetaAlgorithm):
             listener()
         return mean.detach(), log
 
-    def _reward_losses(
-        self, labels: RewardLabels, obs: th.Tensor, actions: th.Tensor, next_obs: th.Tensor, z: th.Tensor
-    ) -> dict[str, th.Tensor]:
+    def _reward_losses(self, labels: RewardLabels, obs: th.Tensor, actions: th.Tensor, z: th.Tensor) -> dict[str, th.Tensor]:
         """Of success, of the reward of a success, and of the task-free part."""
-        obs, actions, next_obs = obs[labels.rows], actions[labels.rows], next_obs[labels.rows]
+        obs, actions, next_obs = obs[labels.rows], actions[labels.rows], self.policy.normalize(labels.next_observations)
         success_loss, reward_loss = self.reward_model.losses(next_obs, z, labels)
         task_free_error = self.reward_model.task_free(obs, actions, next_obs) - labels.task_free
         return {

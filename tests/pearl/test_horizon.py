@@ -9,7 +9,7 @@ from helpers import ENV_ID, TINY
 from sb3_htr import PEARL
 from sb3_htr.pearl.horizon import settings_for, timesteps_for
 
-NAMES = ("gamma", "n_episodes_per_task", "learning_starts", "gradient_steps", "batch_size", "context_size")
+NAMES = ("gamma", "n_steps", "n_episodes_per_task", "learning_starts", "gradient_steps", "batch_size", "context_size")
 
 
 def make(max_episode_steps: int, **given: Any) -> PEARL:
@@ -20,11 +20,11 @@ def make(max_episode_steps: int, **given: Any) -> PEARL:
 @pytest.mark.parametrize(
     ("max_episode_steps", "expected"),
     [
-        (1, (0.0, 10, 199, 10, 1, 1)),
-        (20, (0.9, 10, 3999, 200, 20, 20)),
-        (50, (0.96, 8, 7999, 400, 24, 24)),
-        (200, (0.98, 2, 7999, 400, 24, 24)),
-        (1000, (0.98, 2, 39_999, 2000, 24, 24)),
+        (1, (0.0, 1, 10, 199, 10, 1, 1)),
+        (20, (0.9, 1, 10, 3999, 200, 20, 20)),
+        (50, (0.96, 1, 8, 7999, 400, 24, 24)),
+        (200, (0.98, 5, 2, 7999, 400, 24, 24)),
+        (1000, (0.98, 10, 2, 39_999, 2000, 24, 24)),
     ],
 )
 def test_what_is_not_given_follows_from_the_time_limit(max_episode_steps: int, expected: tuple[float, ...]) -> None:
@@ -33,7 +33,7 @@ def test_what_is_not_given_follows_from_the_time_limit(max_episode_steps: int, e
 
 
 def test_what_is_given_stays() -> None:
-    given: dict[str, Any] = dict(zip(NAMES, (0.5, 3, 7, 11, 5, 9), strict=True))
+    given: dict[str, Any] = dict(zip(NAMES, (0.5, 4, 3, 7, 11, 5, 9), strict=True))
     model = make(200, **given)
     assert {name: getattr(model, name) for name in NAMES} == given
     with pytest.raises(ValueError, match=r"gamma is 1\.5, expected a number from 0 to 1"):

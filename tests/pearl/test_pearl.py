@@ -20,6 +20,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from helpers import ENV_ID, PRIOR, ROLLOUT, TINY, MakePEARL, parameters, with_policy
 from helpers.experience import assert_same
 from sb3_htr import PEARL, evaluate_adaptation
+from sb3_htr.common.type_aliases import MultiTaskSamples
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr import EpisodeClustering
 
@@ -50,6 +51,7 @@ class Counter(BaseCallback):
         {"train_explorer": "belief"},
         {"policy_kwargs": with_policy(normalize_observations=False)},
         {"reward_coef": 0.0},
+        {"n_steps": 5},
         {"replay_buffer_kwargs": {"relabel_probability": 0.0, "rl_reward_type": "dense"}},
         {"replay_buffer_kwargs": {"relabeller": {"name": "SingleEpisodeRelabelling", "hindsight_task_strategy": "final"}}},
         {"replay_buffer_kwargs": {"relabel_probability": 1.0, "relabeller": EpisodeClustering()}},
@@ -78,6 +80,29 @@ def test_the_actor_does_not_shape_z(tiny_pearl: MakePEARL) -> None:
     assert all(p.grad is not None and not p.grad.any() for p in model.encoder.parameters())
     assert all(p.grad is not None and p.grad.any() for p in (*model.actor.parameters(), *model.critic.parameters()))
     assert any(not th.equal(before[name], value) for name, value in parameters(model).items() if name.startswith("actor."))
+
+
+def test_critics_discount_what_follows_by_the_steps_before_it(tiny_pearl: MakePEARL, monkeypatch: Any) -> None:
+    """And SB3 does not warn of a buffer that has no n-step returns, as this one has."""
+    with warnings.catch_warnings(action="error"):
+        model = tiny_pearl(n_steps=3)
+    model.learn(ROLLOUT)
+    assert model.replay_buffer is not None
+    sample = model.replay_buffer.sample
+    asked: list[dict[str, Any]] = []
+
+    def without_what_follows(*args: Any, **sizes: Any) -> MultiTaskSamples:
+        asked.append(sizes)
+        data = sample(*args, **sizes)
+        return data._replace(discounts=th.zeros_like(data.discounts))
+
+    with th.no_grad():
+        for parameter in model.critic_target.parameters():
+            parameter.add_(1e3)
+    monkeypatch.setattr(model.replay_buffer, "sample", without_what_follows)
+    model.train(1)
+    assert asked[0]["n_steps"] == 3 and asked[0]["gamma"] == model.gamma
+    assert model.logger.name_to_value["train/critic_loss"] < 100, "no value of the target critics is in it"
 
 
 def test_the_precision_of_matrix_products_is_that_of_updates_only(tiny_pearl: MakePEARL, monkeypatch: Any) -> None:

@@ -204,8 +204,8 @@ def test_what_a_user_gives_is_not_searched(tmp_path: Path, monkeypatch: pytest.M
     arguments = ["optimize", "--env", ENV_ID, "-f", str(tmp_path), "-n", "480", "--n-trials", "1", "--n-evaluations", "1"]
     assert main([*arguments, "--storage", storage, "--study-name", "test", "--verbose", "0", *params]) == 0
     (trial,) = optimize.create_study(storage, "test").get_trials()
-    searched = {"learning_rate", "tau", "ent_coef", "kl_coef", "latent_dim", "relabel_probability", "hindsight_task_strategy"}
-    assert set(trial.params) == searched
+    searched = {"learning_rate", "tau", "ent_coef", "kl_coef", "latent_dim", "n_steps"}
+    assert set(trial.params) == {*searched, "relabel_probability", "hindsight_task_strategy"}
     (model,) = made
     assert (model.gamma, model.gradient_steps, model.batch_size, model.meta_batch_size) == (0.5, 3, 4, 8)
     assert (model.policy.net_arch, model.policy.encoder_arch) == ([16], [16])

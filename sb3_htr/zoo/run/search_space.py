@@ -26,7 +26,13 @@ FLOATS = {
     "ent_coef": (1e-3, 1e-1),
     "kl_coef": (1e-4, 1e-1),
 }
-INTS = {"batch_size_pow": (3, 8), "meta_batch_size_pow": (3, 6), "gradient_steps_pow": (6, 9), "latent_dim": (2, 8)}
+INTS = {
+    "n_steps": (1, 10),
+    "batch_size_pow": (3, 8),
+    "meta_batch_size_pow": (3, 6),
+    "gradient_steps_pow": (6, 9),
+    "latent_dim": (2, 8),
+}
 
 
 def sample_pearl_params(
@@ -78,7 +84,7 @@ def convert_pearl_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
             replay[name] = value
         elif name == "hindsight_task_strategy":
             replay["relabeller"] = {name: value}
-        elif name in FLOATS:
+        elif name in FLOATS or name in INTS:
             converted[name] = value
         else:
             raise ValueError(f"The trial has {name} {value!r}, which sb3-htr optimize does not try: it is of another program.")
