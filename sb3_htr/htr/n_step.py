@@ -10,8 +10,8 @@ def steps_ahead(index: EpisodeIndex, virtual: np.ndarray, n_steps: int) -> tuple
     :param index: of a store
     :param virtual: (n,) int, virtual rows of some steps
     :param n_steps: how many to look at, these steps among them
-    :return: (n, n_steps) int, virtual rows of each step and of those that follow it, where the episode ends before its last one
-        again and again; and (n,) int, how many they are until then
+    :return: (n, n_steps) int, virtual rows of each step and of those that follow it, with the last one of an episode again
+        where it ends before; and (n,) int, how many they are until then
     """
     if n_steps == 1:
         return virtual[:, None], np.ones(len(virtual), dtype=np.int64)
