@@ -10,7 +10,7 @@ STEPS_PER_TASK = 400
 STEPS_PER_UPDATE = 20
 # The discount reaches as far as the time limit, up to here
 MAX_GAMMA = 0.98
-# A return counts the rewards of one step for so many of an episode, up to so many steps
+# A target looks one step ahead for so many of an episode, up to so many steps
 STEPS_PER_RETURN, MAX_N_STEPS = 40, 10
 # Transitions per task in an update: an episode, up to so many
 MAX_TRANSITIONS = 24
