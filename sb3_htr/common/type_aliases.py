@@ -68,36 +68,23 @@ class RewardLabels(NamedTuple):
     What n of the transitions of a meta-batch would return under each of its M tasks: what a model of rewards learns from.
 
     :param rows: (n,) int64, which transitions of the RL batch
+    :param next_observations: (n, obs_dim), where their one step leads
     :param reward: (n, M) float32, its reward beside the task-free one, above 0 where the transition solves the task
     :param task_free: (n,) float32, the task-free one
     :param inferred: (M,) float32, 1 for tasks with a reward in their context, from which they can be inferred
     """
 
     rows: th.Tensor
+    next_observations: th.Tensor
     reward: th.Tensor
     task_free: th.Tensor
     inferred: th.Tensor
 
 
-class StepsAhead(NamedTuple):
-    """
-    What follows N transitions in their episodes: some steps, fewer where the episode ends before. All float32.
-
-    :param rewards: (N,), discounted sum of the rewards of these steps, that of the transition first, all under its task
-    :param next_observations: (N, obs_dim), behind the last of them
-    :param dones: (N,), 1 where the episode terminated with it
-    :param discounts: (N,), of a value behind it
-    """
-
-    rewards: th.Tensor
-    next_observations: th.Tensor
-    dones: th.Tensor
-    discounts: th.Tensor
-
-
 class MultiTaskSamples(NamedTuple):
     """
-    One meta-batch of M tasks: a context, and N transitions for actor and critics, those of the first task first.
+    One meta-batch of M tasks: a context, and N transitions for actor and critics, those of the first task first. With n-step
+    returns, what follows a transition is what follows n steps, or fewer where the episode ends.
 
     All tensors are on the buffer's device, and float32, unless said otherwise.
 
@@ -105,14 +92,14 @@ class MultiTaskSamples(NamedTuple):
     :param observations: (N, obs_dim)
     :param actions: (N, action_dim), scaled to [-1, 1]
     :param next_observations: (N, obs_dim)
-    :param rewards: (N,)
+    :param rewards: (N,), discounted sum of these steps' rewards
     :param dones: (N,), 1 where the episode terminated (time limits do not count)
+    :param discounts: (N,), of the value of the next observation
     :param lengths: (M,) int64, how many of these transitions are of each task, at least 1
     :param task_ids: (M,) int array, the training task whose replay each row of the meta-batch came from
     :param relabelled: (M,) bool array, whether context and RL batch carry rewards of a hindsight task
-    :param unrewarded: (M,) bool array, whether no reward of the RL batch has a part that depends on the task
+    :param unrewarded: (M,) bool array, whether no transition of the RL batch has a reward with a part that depends on the task
     :param labels: of some of these transitions, None unless asked for, and where the family tells no rewards
-    :param ahead: of all of them, None unless more than one step is asked for
     """
 
     context: Context
@@ -121,9 +108,9 @@ class MultiTaskSamples(NamedTuple):
     next_observations: th.Tensor
     rewards: th.Tensor
     dones: th.Tensor
+    discounts: th.Tensor
     lengths: th.Tensor
     task_ids: np.ndarray
     relabelled: np.ndarray
     unrewarded: np.ndarray
     labels: RewardLabels | None
-    ahead: StepsAhead | None

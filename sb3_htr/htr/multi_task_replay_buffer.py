@@ -13,7 +13,7 @@ from sb3_htr.common.checks import check_has_hooks, check_numbers, check_same_fam
 from sb3_htr.common.random_state import get_generator_state, set_generator_state
 from sb3_htr.common.settings import make
 from sb3_htr.common.task_reward import ROUNDING, task_reward
-from sb3_htr.common.type_aliases import Context, MultiTaskSamples, RewardLabels, StepsAhead, TaskFamily
+from sb3_htr.common.type_aliases import Context, MultiTaskSamples, RewardLabels, TaskFamily
 from sb3_htr.htr.episode_store import EpisodeStore
 from sb3_htr.htr.n_step import n_step_returns, steps_ahead
 from sb3_htr.htr.relabel import RELABELLERS, Relabeller
@@ -348,7 +348,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         :param meta_batch_size: number of tasks, M
         :param context_size: transitions per task for the context, at most
         :param n_labelled: transitions that are rewarded under all tasks of the meta-batch, at most
-        :param n_steps: steps to look ahead of each transition of the RL batch, itself among them
+        :param n_steps: steps of each transition of the RL batch, under one task, to the end of the episode at most
         :param gamma: discount of a step
         :return: the meta-batch
         :raises ValueError: if no episode is complete yet, or the reward hook returns NaN or infinity
@@ -391,7 +391,8 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             self.write_rewards(rows, where, reward_task[of_task[where]], "dense")
         columns = self.transitions
         context_rows, steps = rows[: len(context)], rows[rl].reshape(len(batch), n_steps, -1)
-        first = steps[:, 0]
+        first, last = steps[:, 0], steps[:, -1]
+        returns, discounts = n_step_returns(steps[..., columns.reward], n_ahead, gamma)
         beside = first[:, columns.reward] - first[:, columns.task_free_reward]
         return MultiTaskSamples(
             context=Context(
@@ -402,26 +403,15 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             ),
             observations=self._tensor(first[:, columns.observation]),
             actions=self._tensor(first[:, columns.action]),
-            next_observations=self._tensor(first[:, columns.next_observation]),
-            rewards=self._tensor(first[:, columns.reward]),
-            dones=self._tensor(first[:, columns.done]),
+            next_observations=self._tensor(last[:, columns.next_observation]),
+            rewards=self._tensor(returns),
+            dones=self._tensor(last[:, columns.done]),
+            discounts=self._tensor(discounts),
             lengths=self._tensor(n_batch),
             task_ids=tasks,
             relabelled=relabelled,
             unrewarded=np.logical_and.reduceat(np.abs(beside) <= ROUNDING, np.cumsum(n_batch) - n_batch),
             labels=self._label(first, context_rows, n_context, reward_task, n_labelled),
-            ahead=self._look_ahead(steps, n_ahead, gamma) if n_steps > 1 else None,
-        )
-
-    def _look_ahead(self, steps: np.ndarray, n_ahead: np.ndarray, gamma: float) -> StepsAhead:
-        """Of steps in a row (N, n_steps, width), as many as count."""
-        columns, last = self.transitions, steps[:, -1]
-        rewards, discounts = n_step_returns(steps[..., columns.reward], n_ahead, gamma)
-        return StepsAhead(
-            rewards=self._tensor(rewards),
-            next_observations=self._tensor(last[:, columns.next_observation]),
-            dones=self._tensor(last[:, columns.done]),
-            discounts=self._tensor(discounts),
         )
 
     def _tensor(self, array: np.ndarray) -> th.Tensor:
@@ -452,6 +442,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         inferred = np.logical_or.reduceat(rewarded, np.cumsum(n_context) - n_context)
         return RewardLabels(
             rows=self._tensor(chosen),
+            next_observations=self._tensor(traj.next_observations),
             reward=self._tensor(np.ascontiguousarray(reward.T, dtype=np.float32)),
             task_free=self._tensor(traj.task_free_reward),
             inferred=self._tensor(inferred.astype(np.float32)),

@@ -61,7 +61,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
     :param batch_size: transitions per task for actor and critics, at most
     :param context_size: transitions per task for the context, at most
     :param gamma: discount
-    :param n_steps: steps that targets look ahead. Which of these seven are None follow from the time limit:
+    :param n_steps: steps of a return before a value is asked for. Which of these seven are None follow from the time limit:
         :func:`sb3_htr.pearl.horizon.settings_for`
     :param explorer: chooses z at meta-test: an explorer, its name, or its name and settings
     :param train_explorer: the same for rollouts

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from helpers.experience import add_episode, assert_same, by_task, filled, make_buffer
+from helpers.experience import add_episode, by_task, filled, make_buffer
 
 LENGTHS = (1, 7, 20)
 
@@ -19,14 +19,13 @@ def expected(episode: np.ndarray, rewards: np.ndarray, step: int, n_steps: int, 
     return total, episode[last], gamma ** (last - step + 1)
 
 
-@given(st.integers(0, 2**20), st.integers(2, 25), st.floats(0.5, 1.0))
+@given(st.integers(0, 2**20), st.integers(1, 25), st.floats(0.5, 1.0))
 def test_a_return_has_the_rewards_of_the_hindsight_task(seed: int, n_steps: int, gamma: float) -> None:
     relabeller = {"name": "SingleEpisodeRelabelling", "elsewhere": 0.0}
     buffer = filled(seed, lengths=LENGTHS, seed=seed, relabel_probability=1.0, relabeller=relabeller)
     data = buffer.sample(8, meta_batch_size=8, context_size=20, n_steps=n_steps, gamma=gamma)
-    assert data.ahead is not None
     of_context = (data.context.observations, data.context.actions, data.context.rewards)
-    of_rl = (data.observations, data.actions, data.ahead.rewards, data.ahead.next_observations, data.ahead.discounts)
+    of_rl = (data.observations, data.actions, data.rewards, data.next_observations, data.discounts)
     context = (by_task(values, data.context.lengths) for values in of_context)
     rl = (by_task(values, data.lengths) for values in of_rl)
     for obs, action, rewards, *drawn in zip(*context, *rl, strict=True):
@@ -63,10 +62,9 @@ def test_a_return_has_the_rewards_that_are_stored(settings: dict[str, Any]) -> N
     store = buffer.relabeller.draw(np.zeros(1, dtype=int)).store if buffer.relabel_probability else buffer.episodes
     store.rows[:, columns.reward] = np.random.default_rng(1).random(len(store.rows))
     data = buffer.sample(20, meta_batch_size=64, n_steps=n_steps, gamma=gamma)
-    assert data.ahead is not None
-    ahead, index = data.ahead, store.index()
+    index = store.index()
     stored, own = store.rows[index.rows], family.train_tasks[np.repeat(data.task_ids, data.lengths)]
-    for i, (obs, action, reward) in enumerate(zip(data.observations, data.actions, ahead.rewards, strict=True)):
+    for i, (obs, action, reward) in enumerate(zip(data.observations, data.actions, data.rewards, strict=True)):
         is_drawn = (stored[:, columns.observation] == obs.numpy()) & (stored[:, columns.action] == action.numpy())
         returns = []
         # One episode may be stored under several hindsight tasks
@@ -78,7 +76,7 @@ def test_a_return_has_the_rewards_that_are_stored(settings: dict[str, Any]) -> N
             if buffer.rl_reward_type == "dense":
                 rewards = family.compute_reward(columns.trajectory(steps), own[i], reward_type="dense")
             total, place, discount = expected(steps[:, columns.next_observation], rewards, row - first, n_steps, gamma)
-            assert ahead.discounts[i] == pytest.approx(discount) and (ahead.next_observations[i].numpy() == place).all()
+            assert data.discounts[i] == pytest.approx(discount) and (data.next_observations[i].numpy() == place).all()
             returns.append(total)
         assert np.isclose(reward.item(), returns, atol=1e-6).any()
 
@@ -87,18 +85,6 @@ def test_an_episode_that_terminates_has_no_value_behind_it() -> None:
     buffer = make_buffer(n_envs=1, relabel_probability=0.0)
     add_episode(buffer, [0], 6, np.random.default_rng(0), terminated=True)
     data = buffer.sample(6, meta_batch_size=1, n_steps=3)
-    assert data.ahead is not None
-    steps_left = np.round(np.log(data.ahead.discounts.numpy()) / np.log(0.98)).astype(int)
+    steps_left = np.round(-np.log(data.discounts.numpy()) / -np.log(0.98)).astype(int)
     assert sorted(steps_left.tolist()) == [1, 2, 3, 3, 3, 3]
-    assert data.ahead.dones.sum() == 3, "the last three steps see its end"
-    assert data.dones.sum() == 1
-
-
-def test_looking_ahead_changes_nothing_else_that_is_drawn() -> None:
-    settings: dict[str, Any] = {"n_episodes": 12, "lengths": LENGTHS, "relabel_probability": 0.5}
-    one, several = (filled(**settings).sample(8, meta_batch_size=32, n_labelled=50, n_steps=n) for n in (1, 4))
-    assert one.ahead is None
-    assert_same(one._replace(labels=None), several._replace(labels=None, ahead=None))
-    assert one.labels is not None and several.labels is not None
-    for a, b in zip(one.labels, several.labels, strict=True):
-        assert (a == b).all()
+    assert data.dones.sum() == 3, "the last three steps see its end"

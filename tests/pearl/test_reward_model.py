@@ -14,7 +14,7 @@ def labelled(n_states: int, goals: th.Tensor, inferred: th.Tensor) -> tuple[th.T
     states = 2 * th.rand(n_states, 2) - 1
     distance = th.cdist(states, goals)
     reward = (1 - distance) * (distance < RADIUS)
-    return states, RewardLabels(th.arange(n_states), reward, th.zeros(n_states), inferred)
+    return states, RewardLabels(th.arange(n_states), states, reward, th.zeros(n_states), inferred)
 
 
 def test_it_learns_what_solves_a_task_and_what_that_returns() -> None:
