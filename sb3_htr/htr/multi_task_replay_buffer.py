@@ -369,16 +369,12 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         batch, n_batch = spread(self._rng, batch_source, batch_size)
         virtual = np.concatenate([context, batch])
         task_of_row = np.concatenate([np.repeat(np.arange(meta_batch_size), n) for n in (n_context, n_batch)])
-        store, of_store = self.episodes, relabelled[task_of_row]
+        store, of_store, rl = self.episodes, relabelled[task_of_row], slice(len(context), None)
         if hindsight is not None:
             store = hindsight.store
             if hindsight.elsewhere:
-                anywhere = len(context) + np.flatnonzero(of_store[len(context) :])
-                anywhere = anywhere[self.relabel_rng.random(len(anywhere)) < hindsight.elsewhere]
-                virtual[anywhere] = self.relabel_rng.integers(len(index.rows), size=len(anywhere))
-                of_store[anywhere] = False
+                self._draw_elsewhere(virtual[rl], of_store[rl], hindsight.elsewhere)
         # From here on, n_steps rows for each of the RL batch
-        rl = slice(len(context), None)
         ahead, n_ahead = self._steps_ahead(virtual[rl], of_store[rl], store, n_steps)
         times = np.repeat([1, n_steps], [len(context), len(batch)])
         of_task = np.repeat(task_of_row, times)
@@ -413,6 +409,13 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             unrewarded=np.logical_and.reduceat(np.abs(beside) <= ROUNDING, np.cumsum(n_batch) - n_batch),
             labels=self._label(first, context_rows, n_context, reward_task, n_labelled),
         )
+
+    def _draw_elsewhere(self, virtual: np.ndarray, of_store: np.ndarray, share: float) -> None:
+        """A share of the rows that are of the relabeller's store: any of the replay in their place."""
+        rows = np.flatnonzero(of_store)
+        rows = rows[self.relabel_rng.random(len(rows)) < share]
+        virtual[rows] = self.relabel_rng.integers(len(self.episodes.index().rows), size=len(rows))
+        of_store[rows] = False
 
     def _tensor(self, array: np.ndarray) -> th.Tensor:
         return self.to_torch(array, copy=False)
