@@ -48,7 +48,6 @@ class Cell:
     :param settings: hyperparameters, joined with those of env and method
     :param env_kwargs: arguments of the env
     :param evaluations: what is done with the final model; one row of results for each
-    :param conf: file of hyperparameters, that of the method's algorithm by default
     :param gym_packages: modules that register what of this is not the package's own
     """
 
@@ -64,7 +63,6 @@ class Cell:
     settings: KwArgs
     env_kwargs: KwArgs
     evaluations: tuple[Evaluation, ...]
-    conf: str = ""
     gym_packages: tuple[str, ...] = ()
 
     @property
@@ -91,7 +89,7 @@ class Cell:
         """
         :return: what its numbers are of, as JSON
         """
-        names = ("env_id", "env_kwargs", "method", "settings", "seed", "n_timesteps", "n_episodes", "eval_freq", "conf")
+        names = ("env_id", "env_kwargs", "method", "settings", "seed", "n_timesteps", "n_episodes", "eval_freq")
         return json.dumps({name: getattr(self, name) for name in names}, sort_keys=True)
 
     def check_result(self, path: Path) -> None:
@@ -117,7 +115,6 @@ class Cell:
         kwargs = [f"{key}:{value!r}" for key, value in self.env_kwargs.items()]
         return [
             *("--env", self.env_id, "--method", self.method),
-            *(["-conf", self.conf] if self.conf else []),
             *("-f", str(folder), "--verbose", "0", "-n", str(self.n_timesteps)),
             *("--seed", str(self.seed), "--eval-freq", str(self.eval_freq), "--eval-episodes", str(self.n_episodes)),
             *(["-params", *settings] if settings else []),

@@ -6,11 +6,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from sb3_htr.experiments import figures
 from sb3_htr.experiments.ablations import ABLATIONS
 from sb3_htr.experiments.cell import Cell, Evaluation, KwArgs
 from sb3_htr.zoo.run.agents import WRAPPERS
 from sb3_htr.zoo.run.method import get_method
+from sb3_htr.zoo.run.shipped import hyperparams_file
 
 EXPLORERS = ("belief", "learned-prior", "aggregate", "prior")
 BELIEF = ("belief",)
@@ -66,7 +69,6 @@ class Experiment:
     :param models_of: name of the experiment whose runs are tested; by default it trains its own
     :param figure: draws the results of all cells into a file
     :param n_episodes: adaptation episodes on a task, in training's evaluations and in those of the final models
-    :param conf: file of hyperparameters, that of each method's algorithm by default
     """
 
     name: str
@@ -80,7 +82,6 @@ class Experiment:
     models_of: str = ""
     figure: Callable[[dict[Cell, Path], Path], None] = figures.learning
     n_episodes: int = 20
-    conf: str = ""
 
     def cells(self, seeds: int | None = None, scale: float = 1.0) -> list[Cell]:
         """
@@ -103,7 +104,6 @@ class Experiment:
                 settings=variant.settings,
                 env_kwargs=variant.env_kwargs,
                 evaluations=self._evaluations_of(variant.method),
-                conf=self.conf,
             )
             for seed in range(1, (seeds or self.seeds) + 1)
             for variant in self.variants
@@ -155,6 +155,13 @@ TUNED_DENSE: KwArgs = {
     "policy_kwargs": {"latent_dim": 8},
 }
 
+# All but what an experiment and its methods say themselves
+PAPER: KwArgs = {
+    key: value
+    for key, value in yaml.safe_load(hyperparams_file("pearl_paper.yml").read_text())["default"].items()
+    if key not in ("policy", "method", "n_timesteps")
+}
+
 ALL = (
     Experiment(
         "point_robot",
@@ -177,10 +184,9 @@ ALL = (
         "The settings of the papers, and their protocol.",
         POINT,
         1_000_000,
-        (Variant("htr-ser-prior"),),
+        (Variant("htr-ser-prior", settings=PAPER),),
         eval_freq=50_000,
         evaluations=by(("prior", "learned-prior", "belief")),
-        conf="pearl_paper.yml",
     ),
     Experiment(
         "ablation",

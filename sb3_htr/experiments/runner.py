@@ -20,7 +20,7 @@ from sb3_htr.experiments.protocol import evaluate
 from sb3_htr.zoo.commands import train
 from sb3_htr.zoo.run.agents import RECORD, agent_at, file_stem, find_runs, n_steps_of, read_record
 from sb3_htr.zoo.run.algorithm import Model
-from sb3_htr.zoo.run.arguments import ALWAYS, given_arguments
+from sb3_htr.zoo.run.arguments import ALWAYS
 from sb3_htr.zoo.run.learned import seconds_at
 from sb3_htr.zoo.run.trust import import_packages
 
@@ -126,8 +126,7 @@ def find_finished(cell: Cell, folder: Path) -> tuple[Path, Model] | None:
                     f"{run} has {key} {record[key]!r}, but {cell.experiment}/{cell.name} needs {getattr(cell, key)!r}: "
                     f"move this run away, or choose other --runs."
                 )
-        given = given_arguments(record["arguments"])
-        has, needs = (_settings(arguments) for arguments in (given, cell.training(folder)))
+        has, needs = (_settings(arguments) for arguments in (record["arguments"], cell.training(folder)))
         if has != needs:
             raise ValueError(
                 f"{run} has the settings {sorted(has)}, but {cell.experiment}/{cell.name} needs {sorted(needs)}: move this "
@@ -140,8 +139,8 @@ def find_finished(cell: Cell, folder: Path) -> tuple[Path, Model] | None:
 
 
 def _settings(arguments: list[str]) -> set[str]:
-    """Of the arguments of a training: hyperparameters, with their file, and what its evaluations are."""
+    """Of the arguments of a training: hyperparameters, and what its evaluations are."""
     after = arguments[arguments.index("-params") + 1 :] if "-params" in arguments else []
     options = {**ALWAYS, **dict(pairwise(arguments))}
-    others = {f"{option} {options[option]}" for option in ("-conf", "--eval-episodes", "--eval-freq") if option in options}
-    return {*takewhile(lambda word: not word.startswith("-"), after), *others}
+    evaluations = {f"{option} {options.get(option)}" for option in ("--eval-episodes", "--eval-freq")}
+    return {*takewhile(lambda word: not word.startswith("-"), after), *evaluations}

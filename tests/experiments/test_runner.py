@@ -77,8 +77,6 @@ def test_a_killed_run_goes_on_and_a_finished_one_is_tested(tmp_path: Path, monke
         find_finished(replace(others, seed=2), folder)
     with pytest.raises(ValueError, match=r"has the settings .*'batch_size:4'.* needs .*'batch_size:5'"):
         find_finished(replace(others, settings={**SMALL, "batch_size": 5}), folder)
-    with pytest.raises(ValueError, match=r"needs .*'-conf pearl_paper.yml'"):
-        find_finished(replace(others, conf="pearl_paper.yml"), folder)
     assert find_finished(replace(others, n_timesteps=1200), tmp_path / "nowhere") is None
 
 

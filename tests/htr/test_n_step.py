@@ -85,6 +85,6 @@ def test_an_episode_that_terminates_has_no_value_behind_it() -> None:
     buffer = make_buffer(n_envs=1, relabel_probability=0.0)
     add_episode(buffer, [0], 6, np.random.default_rng(0), terminated=True)
     data = buffer.sample(6, meta_batch_size=1, n_steps=3)
-    steps_left = np.round(-np.log(data.discounts.numpy()) / -np.log(0.98)).astype(int)
+    steps_left = np.round(np.log(data.discounts.numpy()) / np.log(0.98)).astype(int)
     assert sorted(steps_left.tolist()) == [1, 2, 3, 3, 3, 3]
     assert data.dones.sum() == 3, "the last three steps see its end"
