@@ -144,7 +144,9 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         if self.env is None:
             # Loaded for prediction only: SB3 wants a buffer, we want no memory of it
             self.replay_buffer = ReplayBuffer(1, self.observation_space, self.action_space)  # type: ignore[assignment]
-            super()._setup_model()
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "`n_steps=")
+                super()._setup_model()
             self.replay_buffer = None
         else:
             self._check_rollouts()
