@@ -8,6 +8,7 @@ import pickle
 import random
 import re
 import threading
+import warnings
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -251,6 +252,14 @@ def test_settings_of_an_untrusted_file_are_joined_with_those_given(tiny_pearl: M
     model = load_untrusted(tmp_path / "model", ENV_ID, **given)
     assert model.policy.latent_dim == 3 and model.replay_buffer is not None
     assert (model.replay_buffer.relabel_probability, model.replay_buffer.context_episodes) == (0.3, 2)
+
+
+def test_a_file_of_n_step_returns_is_loaded_without_a_warning(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    tiny_pearl(n_steps=3).save(tmp_path / "model")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        alone, with_env = PEARL.load(tmp_path / "model"), PEARL.load(tmp_path / "model", env=make_task_vec_env(ENV_ID, 3))
+    assert alone.n_steps == with_env.n_steps == 3
 
 
 def test_a_file_is_loaded_as_what_it_is_and_with_settings_that_are_known(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
