@@ -155,12 +155,15 @@ TUNED_DENSE: KwArgs = {
     "policy_kwargs": {"latent_dim": 8},
 }
 
-# All but what an experiment and its methods say themselves
-PAPER: KwArgs = {
-    key: value
-    for key, value in yaml.safe_load(hyperparams_file("pearl_paper.yml").read_text())["default"].items()
-    if key not in ("policy", "method", "n_timesteps")
-}
+
+def settings_of(file: str) -> KwArgs:
+    """
+    :param file: name of a YAML file of the package
+    :return: what it says for all envs, but for what an experiment and its methods say themselves
+    """
+    block: KwArgs = yaml.safe_load(hyperparams_file(file).read_text())["default"]
+    return {key: value for key, value in block.items() if key not in ("policy", "method", "n_timesteps")}
+
 
 ALL = (
     Experiment(
@@ -184,9 +187,17 @@ ALL = (
         "The settings of the papers, and their protocol.",
         POINT,
         1_000_000,
-        (Variant("htr-ser-prior", settings=PAPER),),
+        (Variant("htr-ser-prior", settings=settings_of("pearl_paper.yml")),),
         eval_freq=50_000,
         evaluations=by(("prior", "learned-prior", "belief")),
+    ),
+    Experiment(
+        "prior",
+        "PEARL's own protocol, in rollouts and at meta-test, with settings made for it: HTR, and the dense proxy reward.",
+        POINT,
+        150_000,
+        tuple(Variant(method, settings=settings_of("pearl_prior.yml")) for method in ("htr-ser-prior", "pearl-dense-prior")),
+        evaluations=by(("prior", "belief")),
     ),
     Experiment(
         "ablation",

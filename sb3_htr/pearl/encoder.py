@@ -61,9 +61,13 @@ class ContextEncoder(nn.Module):
         """
         mean, raw = self.factors(rows).chunk(2, dim=-1)
         # Of a slice of columns, softplus takes eight times as long
-        precision = 1.0 / F.softplus(raw.contiguous()).clamp(min=MIN_VARIANCE)
+        precision = self._precision(raw.contiguous())
         factors = th.cat([precision, precision * mean], dim=1)
         return state + th.segment_reduce(factors, "sum", lengths=lengths, axis=0, unsafe=True)
+
+    def _precision(self, raw: th.Tensor) -> th.Tensor:
+        """Of factors, (n, latent_dim), from what the network says of it."""
+        return 1.0 / F.softplus(raw).clamp(min=MIN_VARIANCE)
 
     def posterior(self, state: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
@@ -73,3 +77,35 @@ class ContextEncoder(nn.Module):
         precision, precision_mean = state.chunk(2, dim=-1)
         variance = 1.0 / precision.masked_fill(precision == 0, 1.0)
         return variance * precision_mean, variance
+
+
+class PriorFactorEncoder(ContextEncoder):
+    """
+    The same with the prior N(0, I) as one more factor of the product, and factors whose precision can be nothing.
+
+    Bayes' rule has this factor, PEARL's product has not: there, every transition narrows the posterior, and that of a hundred
+    misses is as narrow as that of a success. Here, what says nothing of the task changes nothing, however much of it there is.
+    """
+
+    def posterior(self, state: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        precision, precision_mean = state.chunk(2, dim=-1)
+        variance = 1.0 / (1.0 + precision)
+        return variance * precision_mean, variance
+
+    def _precision(self, raw: th.Tensor) -> th.Tensor:
+        return F.softplus(raw)
+
+
+#: Encoders by the names that YAML files have for them
+ENCODERS: dict[str, type[ContextEncoder]] = {encoder.__name__: encoder for encoder in (ContextEncoder, PriorFactorEncoder)}
+
+
+def to_encoder_class(encoder: type[ContextEncoder] | str) -> type[ContextEncoder]:
+    """
+    :param encoder: a class, or its name
+    :return: the class
+    :raises ValueError: for an unknown name
+    """
+    if isinstance(encoder, str) and encoder not in ENCODERS:
+        raise ValueError(f"encoder_class is {encoder!r}, expected one of {sorted(ENCODERS)}, or a class.")
+    return ENCODERS[encoder] if isinstance(encoder, str) else encoder

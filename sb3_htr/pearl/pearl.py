@@ -63,6 +63,8 @@ class PEARL(OffPolicyMetaAlgorithm):
         episode; an episode or 24 by default (PEARL's reference: 1024)
     :param kl_coef: weight of the KL divergence of the posterior from N(0, I), summed over z's dimensions and averaged over
         tasks, beside the critics' squared errors averaged over transitions (PEARL's reference, in these units: 0.0016)
+    :param final_kl_coef: to which this weight grows, or falls, by the end of training, by the same factor in equal times; it
+        stays what it is by default (PEARL's reference)
     :param reward_coef: weight in z of the losses of the reward model, by which z learns to tell tasks apart; at 0, the model
         learns and leaves z alone. By measurement, on a two-link arm (one seed): .91 of the tasks are solved at 0, .99 and more
         at .5 and 2. It learns in each update: in one of four, at four times the weight, the Wheeled robot solves .90 of the
@@ -112,6 +114,7 @@ class PEARL(OffPolicyMetaAlgorithm):
         meta_batch_size: int = 64,
         context_size: int | None = None,
         kl_coef: float = 0.001,
+        final_kl_coef: float | None = None,
         reward_coef: float = 2.0,
         n_tasks_per_rollout: int = 20,
         n_episodes_per_task: int | None = None,
@@ -156,6 +159,7 @@ class PEARL(OffPolicyMetaAlgorithm):
         )
         self.meta_batch_size = meta_batch_size
         self.kl_coef = kl_coef
+        self.final_kl_coef = final_kl_coef
         self.reward_coef = reward_coef
         self.matmul_precision = matmul_precision
         self._posterior_watch = PosteriorWatch()
@@ -168,11 +172,14 @@ class PEARL(OffPolicyMetaAlgorithm):
             meta_batch_size=(self.meta_batch_size, 1, infinity),
             target_update_interval=(self.target_update_interval, 1, infinity),
             kl_coef=(self.kl_coef, 0.0, infinity),
+            final_kl_coef=(self.kl_coef if self.final_kl_coef is None else self.final_kl_coef, 0.0, infinity),
             reward_coef=(self.reward_coef, 0.0, infinity),
             tau=(self.tau, 0.0, 1.0),
         )
         if self.tau == 0:
             raise ValueError("tau is 0, with which the target critics would never learn: expected a number above 0, up to 1.")
+        if self.final_kl_coef is not None and 0 in (self.kl_coef, self.final_kl_coef):
+            raise ValueError("kl_coef and final_kl_coef are a factor apart, so neither may be 0: expected numbers above 0.")
         if self.matmul_precision not in PRECISIONS:
             raise ValueError(f"matmul_precision is {self.matmul_precision!r}, expected one of {list(PRECISIONS)}.")
         super()._setup_model()
@@ -204,8 +211,14 @@ class PEARL(OffPolicyMetaAlgorithm):
             self.logger.record(f"train/{key}", value)
         for key, value in self.replay_buffer.stats().items():
             self.logger.record(key, value)
+        self.logger.record("train/kl_coef", self._current_kl_coef())
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self._learn_knowledge(th.cat(means[-20:]))
+
+    def _current_kl_coef(self) -> float:
+        if self.final_kl_coef is None:
+            return self.kl_coef
+        return float(self.kl_coef ** (remaining := self._current_progress_remaining) * self.final_kl_coef ** (1 - remaining))
 
     def _update(self, batch_size: int) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """One update of all networks. Posterior means (M, latent_dim), and what to log."""
@@ -236,7 +249,7 @@ class PEARL(OffPolicyMetaAlgorithm):
         q = self.critic(obs_z, data.actions)
         critic_loss = ((q - target_q).square() * weight).sum()
         learning = [self.critic.optimizer, self.encoder.optimizer]
-        loss, reward_losses = critic_loss + self.kl_coef * kl, {}
+        loss, reward_losses = critic_loss + self._current_kl_coef() * kl, {}
         if data.labels is not None:
             learning.append(self.reward_model.optimizer)
             # The values of z, of which the gradient is weighted

@@ -19,7 +19,7 @@ from sb3_htr.common.latent_policy import LatentPolicy
 from sb3_htr.common.linear import Linear, Stack, with_fast_layers
 from sb3_htr.common.normalizer import ObservationNormalizer
 from sb3_htr.common.type_aliases import Context
-from sb3_htr.pearl.encoder import ContextEncoder
+from sb3_htr.pearl.encoder import ContextEncoder, to_encoder_class
 from sb3_htr.pearl.reward_model import RewardModel
 
 
@@ -73,7 +73,7 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
     :param lr_schedule: learning rate
     :param net_arch: hidden units of actor and critics (paper A.2: ``[300, 300, 300]``)
     :param encoder_arch: hidden units of the context encoder (paper A.2: ``[200, 200, 200]``)
-    :param encoder_class: what infers z, see :class:`ContextEncoder`
+    :param encoder_class: what infers z, see :class:`ContextEncoder`; or the name of one of :mod:`sb3_htr.pearl.encoder`
     :param latent_dim: dimension of z (paper A.2: 5)
     :param normalize_observations: all networks see observations less their running mean in training, divided by the standard
         deviation. By measurement (one seed each), the Wheeled robot learns in half the steps with it, and the Point Robot as
@@ -91,7 +91,7 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
         lr_schedule: Schedule,
         net_arch: list[int] | None = None,
         encoder_arch: list[int] | None = None,
-        encoder_class: type[ContextEncoder] = ContextEncoder,
+        encoder_class: type[ContextEncoder] | str = ContextEncoder,
         latent_dim: int = 5,
         normalize_observations: bool = True,
         activation_fn: type[nn.Module] = nn.ReLU,
@@ -104,7 +104,7 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
             optimizer_kwargs = {"fused": True, **(optimizer_kwargs or {})}
         self.latent_dim = latent_dim
         self.encoder_arch = [128, 128] if encoder_arch is None else encoder_arch
-        self.encoder_class = encoder_class
+        self.encoder_class = to_encoder_class(encoder_class)
         self.normalize_observations = normalize_observations
         obs_dim, action_dim = (int(np.prod(space.shape)) for space in (observation_space, action_space))
         self.obs_dim, self.context_dim = obs_dim, context_dim(obs_dim, action_dim)

@@ -15,6 +15,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from sb3_htr.common.plain import MAX_BYTES, load_plain
 from sb3_htr.common.saving import with_suffix
 from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.pearl.encoder import ENCODERS
 from sb3_htr.pearl.pearl import PEARL
 from sb3_htr.pearl.policies import PEARLPolicy
 
@@ -30,7 +31,8 @@ MAX_BUFFER = 2 * 10**7
 # Arguments of PEARL that are numbers and take no memory, those that may be words, and counters
 NUMBERS = (
     *("learning_rate", "learning_starts", "batch_size", "tau", "gamma", "gradient_steps", "ent_coef", "target_entropy"),
-    *("target_update_interval", "meta_batch_size", "context_size", "kl_coef", "reward_coef"),
+    *("target_update_interval", "meta_batch_size", "context_size", "n_steps"),
+    *("kl_coef", "final_kl_coef", "reward_coef"),
     *("n_tasks_per_rollout", "n_episodes_per_task", "buffer_size"),
 )
 WORDS = {"ent_coef": r"auto(_(?=.*[1-9])\d+(\.\d+)?)?", "target_entropy": "auto", "matmul_precision": "highest|high|medium"}
@@ -120,7 +122,10 @@ def _schedule(learning_rate: Any) -> dict[str, LinearSchedule]:
 
 
 def _policy_kwargs(given: dict[str, Any]) -> dict[str, Any]:
-    unknown = [name for name in given if name not in ("latent_dim", "net_arch", "encoder_arch", "normalize_observations")]
+    known = {"latent_dim", "net_arch", "encoder_arch", "normalize_observations"}
+    if given.get("encoder_class") in list(ENCODERS):
+        known.add("encoder_class")
+    unknown = [name for name in given if name not in known]
     if any(not name.startswith(":") for name in unknown):
         raise ValueError(
             f"its policy has the setting {unknown[0]!r}, which only PEARL.load restores, and that may run code of the file."

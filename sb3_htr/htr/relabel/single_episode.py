@@ -60,7 +60,11 @@ class SingleEpisodeRelabelling(Relabeller):
         training task, and others are drawn in the same way as long as there is none, once such are within reach. What was
         reached is not what will be asked for: objects fall off the table, and ``"even"`` draws what is rare. The other rows
         keep what is learnt as wide as what is reached
-    :raises ValueError: for an unknown strategy or source, or a share out of [0, 1]
+    :param context_episodes: at 1 (B.2, default) the context is that one episode. Above, it is a window of from 1 to so many
+        neighbouring episodes of the task, all under the hindsight task, that contains this episode or ends right before it:
+        what a posterior over all episodes of an adaptation has to make sense of, misses before the first success too. The
+        model's ``context_size`` should be that of so many episodes
+    :raises ValueError: for an unknown strategy or source, a share out of [0, 1], or no episode
     """
 
     def __init__(
@@ -70,8 +74,10 @@ class SingleEpisodeRelabelling(Relabeller):
         elsewhere: float = 0.25,
         prefer_unsolved: bool = True,
         like_training: float = 0.5,
+        context_episodes: int = 1,
     ) -> None:
         check_numbers(elsewhere=(elsewhere, 0.0, 1.0), like_training=(like_training, 0.0, 1.0))
+        check_numbers(context_episodes=(context_episodes, 1, float("inf")))
         check_flags(prefer_unsolved=prefer_unsolved)
         self.elsewhere = elsewhere
         self.hindsight_task_strategy = HindsightTaskStrategy.of(hindsight_task_strategy)
@@ -80,6 +86,7 @@ class SingleEpisodeRelabelling(Relabeller):
         self.rl_batch_source = rl_batch_source
         self.prefer_unsolved = prefer_unsolved
         self.like_training = like_training
+        self.context_episodes = context_episodes
 
     def bind(self, buffer: "MultiTaskReplayBuffer") -> None:
         super().bind(buffer)
@@ -109,7 +116,21 @@ class SingleEpisodeRelabelling(Relabeller):
         batch = context = np.stack([index.episode_row[episode], index.episode_row[episode + 1]], axis=1)
         if self.rl_batch_source == "task":
             batch = index.all_episodes(np.searchsorted(index.task_episode, episode, side="right") - 1)
+        if self.context_episodes > 1:
+            context = self._window(episode)
         return HindsightDraw(buffer.episodes, context, batch, hindsight_task[chosen], False, self.elsewhere)
+
+    def _window(self, episode: np.ndarray) -> np.ndarray:
+        """(m, 2) int, virtual rows of the neighbouring episodes that contexts are drawn from."""
+        rng, index = self.buffer.relabel_rng, self.buffer.episodes.index()
+        task = np.searchsorted(index.task_episode, episode, side="right") - 1
+        n = rng.integers(1, self.context_episodes + 1, size=len(episode))
+        first = episode - rng.integers(0, n + 1)
+        end = np.minimum(first + n, index.task_episode[task + 1])
+        first = np.maximum(first, index.task_episode[task])
+        # Nothing is before the first episode of a task
+        end = np.maximum(end, first + 1)
+        return np.stack([index.episode_row[first], index.episode_row[end]], axis=1)
 
     def _like_training(self, n: int) -> np.ndarray:
         """(n,) bool, for which rows a hindsight task like those of training is looked for."""
