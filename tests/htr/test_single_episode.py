@@ -56,6 +56,33 @@ def test_context_and_rl_batch_come_from_one_episode() -> None:
         assert {tuple(step) for step in steps} <= {tuple(step) for step in episode}
 
 
+@given(st.integers(0, 2**20), st.integers(2, 6), st.sampled_from([(20,), (1, 7, 20)]))
+def test_a_context_can_be_a_window_of_neighbouring_episodes_under_one_task(
+    seed: int, most: int, lengths: tuple[int, ...]
+) -> None:
+    buffer = filled(12, lengths=lengths, seed=seed, **relabelling(elsewhere=0.0, context_episodes=most))
+    index = buffer.episodes.index()
+    draw = buffer.relabeller.draw(np.arange(64) % buffer.n_tasks)
+    draw.check(64, FAMILY.train_tasks.shape[1])
+    first, end = (np.searchsorted(index.episode_row, side) for side in draw.context.T)
+    own = np.searchsorted(index.episode_row, draw.batch[:, 0])
+    np.testing.assert_array_equal(index.episode_row[first], draw.context[:, 0], err_msg="whole episodes")
+    np.testing.assert_array_equal(index.episode_row[end], draw.context[:, 1], err_msg="whole episodes")
+    assert ((end - first >= 1) & (end - first <= most)).all()
+    # It contains the episode that the RL batch is from, or ends right before it
+    assert ((first <= own) & (own <= end)).all()
+    task_of = np.searchsorted(index.task_episode, np.stack([first, end - 1, own]), side="right")
+    assert (task_of == task_of[2]).all(), "of one training task"
+
+
+def test_some_windows_hold_the_first_success_and_some_the_misses_before() -> None:
+    data = filled(n_episodes=24, **relabelling(context_episodes=3)).sample(16, meta_batch_size=200, context_size=60)
+    episodes = data.context.lengths.numpy() // 20
+    assert set(episodes) == {1, 2, 3}
+    rewarded = np.array([rewards.any() for rewards in by_task(data.context.rewards, data.context.lengths)])
+    assert 0.6 < rewarded.mean() < 1
+
+
 def test_a_share_of_the_rl_batch_comes_from_anywhere_under_the_same_task() -> None:
     buffer = filled(n_episodes=24, **relabelling(elsewhere=0.25))
     data = buffer.sample(16, meta_batch_size=200, context_size=20)

@@ -7,7 +7,7 @@ from torch import nn
 from torch.distributions import Independent, Normal, kl_divergence
 from torch.nn import functional as F
 
-from sb3_htr.pearl.encoder import MIN_VARIANCE, ContextEncoder, kl_to_prior
+from sb3_htr.pearl.encoder import MIN_VARIANCE, ContextEncoder, PriorFactorEncoder, kl_to_prior
 
 CONTEXT_DIM = 4
 sizes = st.integers(1, 6)
@@ -90,3 +90,29 @@ def test_the_order_of_a_context_makes_no_difference(seed: int) -> None:
     order = th.cat([th.randperm(3), 3 + th.randperm(6)])
     for actual, wanted in zip(posterior(encoder, context[order], [3, 6]), posterior(encoder, context, [3, 6]), strict=True):
         th.testing.assert_close(actual, wanted)
+
+
+@given(seeds, st.lists(st.integers(0, 4), min_size=1, max_size=5), sizes)
+def test_the_prior_can_be_a_factor_of_the_product(seed: int, lengths: list[int], latent_dim: int) -> None:
+    """Of the density: that of N(0, I) times those of the rows, whatever the order in which they come."""
+    th.manual_seed(seed)
+    encoder = PriorFactorEncoder(CONTEXT_DIM, latent_dim, [8], nn.Tanh).double()
+    rows = th.randn(sum(lengths), CONTEXT_DIM, dtype=th.float64)
+    mean, variance = posterior(encoder, rows, lengths)
+    points = th.linspace(-2, 2, 7, dtype=th.float64)[:, None].expand(-1, latent_dim)
+    for i, task in enumerate(rows.split(lengths)):
+        factor_mean, raw = encoder.factors(task).chunk(2, dim=-1)
+        likelihood = Normal(factor_mean, F.softplus(raw).rsqrt()).log_prob(points[:, None]).sum(dim=1)
+        difference = Normal(mean[i], variance[i].sqrt()).log_prob(points) - Normal(0, 1).log_prob(points) - likelihood
+        th.testing.assert_close(difference, difference[:1].expand_as(difference), rtol=1e-6, atol=1e-6)
+
+
+def test_rows_that_say_nothing_leave_the_prior_however_many_they_are() -> None:
+    encoder = PriorFactorEncoder(CONTEXT_DIM, 3, [])
+    with th.no_grad():
+        for parameter in encoder.parameters():
+            parameter.zero_()
+        encoder.factors[0].bias[3:] = -20.0
+    mean, variance = posterior(encoder, th.randn(1000, CONTEXT_DIM), [1000])
+    th.testing.assert_close(mean, th.zeros(1, 3))
+    th.testing.assert_close(variance, th.ones(1, 3), rtol=1e-4, atol=0)

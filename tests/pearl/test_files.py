@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from stable_baselines3 import SAC
 from stable_baselines3.common.utils import LinearSchedule
 
-from helpers import ENV_ID, ROLLOUT, MakePEARL, many, parameters
+from helpers import ENV_ID, ROLLOUT, MakePEARL, many, parameters, with_policy
 from helpers.bombs import Bomb, bombs
 from sb3_htr import PEARL, AdaptedAgent, evaluate_adaptation, load_untrusted
 from sb3_htr.adaptation import Aggregate, Belief, Prior
@@ -100,10 +100,14 @@ def test_an_untrusted_model_acts_as_the_one_that_was_saved(tiny_pearl: MakePEARL
     replay = {"relabeller": {"name": "EpisodeClustering", "cell_size": 0.3}, "relabel_probability": 0.4}
     rate = LinearSchedule(2e-3, 1e-4, 0.5)
     settings = {"learning_rate": rate, "replay_buffer_kwargs": replay, **explorers}
+    policy_kwargs = with_policy(encoder_class="PriorFactorEncoder")
+    settings |= {"n_steps": 2, "final_kl_coef": 0.03, "policy_kwargs": policy_kwargs}
     model = tiny_pearl(gamma=0.7, kl_coef=0.02, context_size=7, **settings).learn(3 * ROLLOUT)
     model.save(tmp_path / "model.zip")
     loaded = load_untrusted(tmp_path / "model.zip", ENV_ID)
     assert loaded.gamma == 0.7 and loaded.kl_coef == 0.02 and loaded.context_size == 7
+    assert loaded.n_steps == 2 and loaded.final_kl_coef == 0.03
+    assert type(loaded.policy.encoder) is type(model.policy.encoder)
     assert loaded.num_timesteps == model.num_timesteps and loaded._n_updates == model._n_updates
     assert loaded.replay_buffer_kwargs == replay and vars(loaded.learning_rate) == vars(rate)
     assert loaded.explorer == Belief(margin=2.0) and loaded.train_explorer == Prior(2)

@@ -52,6 +52,7 @@ class Counter(BaseCallback):
         {"policy_kwargs": with_policy(normalize_observations=False)},
         {"reward_coef": 0.0},
         {"n_steps": 5},
+        {"final_kl_coef": 0.1, "policy_kwargs": with_policy(encoder_class="PriorFactorEncoder")},
         {"replay_buffer_kwargs": {"relabel_probability": 0.0, "rl_reward_type": "dense"}},
         {"replay_buffer_kwargs": {"relabeller": {"name": "SingleEpisodeRelabelling", "hindsight_task_strategy": "final"}}},
         {"replay_buffer_kwargs": {"relabel_probability": 1.0, "relabeller": EpisodeClustering()}},
@@ -80,6 +81,16 @@ def test_the_actor_does_not_shape_z(tiny_pearl: MakePEARL) -> None:
     assert all(p.grad is not None and not p.grad.any() for p in model.encoder.parameters())
     assert all(p.grad is not None and p.grad.any() for p in (*model.actor.parameters(), *model.critic.parameters()))
     assert any(not th.equal(before[name], value) for name, value in parameters(model).items() if name.startswith("actor."))
+
+
+def test_the_weight_of_the_kl_term_grows_by_the_same_factor_in_equal_times(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl(kl_coef=0.001, final_kl_coef=0.1).learn(2 * ROLLOUT)
+    logged = []
+    for remaining in (1.0, 0.5, 0.0):
+        model._current_progress_remaining = remaining
+        model.train(1)
+        logged.append(model.logger.name_to_value["train/kl_coef"])
+    assert logged == pytest.approx([0.001, 0.01, 0.1])
 
 
 def test_critics_discount_what_follows_by_the_steps_before_it(tiny_pearl: MakePEARL, monkeypatch: Any) -> None:
