@@ -11,8 +11,8 @@ from sb3_htr.experiments.protocol import MIN_RUNS
 RESULTS = Path(__file__).parents[1] / "results"
 DOCUMENTS = (RESULTS.parent / "README.md", RESULTS.parent / "docs" / "results.md", RESULTS.parent / "docs" / "performance.md")
 # Experiments, methods and explorers in the table of README.md
-ENVS = ("point_robot", "wheeled", "ant", "fetch_reach", "fetch_push")
-METHODS = ("htr-ser", "pearl-dense", "pearl-sparse", "pearl-sparse-prior")
+ENVS = ("point_robot", "prior", "wheeled", "ant", "fetch_reach", "fetch_push")
+METHODS = ("htr-ser", "htr-ser-prior", "pearl-dense", "pearl-dense-prior", "pearl-sparse", "pearl-sparse-prior")
 EXPLORERS = ("belief", "prior")
 COLUMNS = {
     "last_episode_return": "return of episode {n_episodes}",

@@ -60,9 +60,9 @@ def test_context_and_rl_batch_come_from_one_episode() -> None:
 def test_a_context_can_be_a_window_of_neighbouring_episodes_under_one_task(
     seed: int, most: int, lengths: tuple[int, ...]
 ) -> None:
-    buffer = filled(12, lengths=lengths, seed=seed, **relabelling(elsewhere=0.0, context_episodes=most))
+    buffer = filled(seed, n_episodes=24, lengths=lengths, seed=seed, **relabelling(elsewhere=0.0, context_episodes=most))
     index = buffer.episodes.index()
-    draw = buffer.relabeller.draw(np.arange(64) % buffer.n_tasks)
+    draw = buffer.relabeller.draw(np.resize(np.flatnonzero(buffer.n_episodes), 64))
     draw.check(64, FAMILY.train_tasks.shape[1])
     first, end = (np.searchsorted(index.episode_row, side) for side in draw.context.T)
     own = np.searchsorted(index.episode_row, draw.batch[:, 0])
