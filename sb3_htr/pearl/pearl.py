@@ -218,7 +218,7 @@ class PEARL(OffPolicyMetaAlgorithm):
     def _current_kl_coef(self) -> float:
         if self.final_kl_coef is None:
             return self.kl_coef
-        return float(self.kl_coef ** (remaining := self._current_progress_remaining) * self.final_kl_coef ** (1 - remaining))
+        return float(self.kl_coef * (self.final_kl_coef / self.kl_coef) ** (1.0 - self._current_progress_remaining))
 
     def _update(self, batch_size: int) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """One update of all networks. Posterior means (M, latent_dim), and what to log."""

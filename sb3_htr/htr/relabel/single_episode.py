@@ -76,8 +76,11 @@ class SingleEpisodeRelabelling(Relabeller):
         like_training: float = 0.5,
         context_episodes: int = 1,
     ) -> None:
-        check_numbers(elsewhere=(elsewhere, 0.0, 1.0), like_training=(like_training, 0.0, 1.0))
-        check_numbers(context_episodes=(context_episodes, 1, float("inf")))
+        check_numbers(
+            elsewhere=(elsewhere, 0.0, 1.0),
+            like_training=(like_training, 0.0, 1.0),
+            context_episodes=(context_episodes, 1, float("inf")),
+        )
         check_flags(prefer_unsolved=prefer_unsolved)
         self.elsewhere = elsewhere
         self.hindsight_task_strategy = HindsightTaskStrategy.of(hindsight_task_strategy)
