@@ -54,7 +54,32 @@ def commit(*paths: str) -> dict[str, str | bool]:
 
 def named(code: Mapping[str, Any]) -> str:
     """
-    :param code: ``commit`` and ``clean``, as of :func:`commit`
-    :return: the commit, and whether it was changed
+    :param code: ``commit`` and ``clean``, as of :func:`commit`; with ``resumed_by``, those of the code that went on as well
+    :return: the commits, and whether they were changed
     """
-    return f"{code.get('commit', 'unknown')}{'' if code.get('clean', True) else ' with changes'}"
+    names = [
+        f"{by.get('commit', 'unknown')}{'' if by.get('clean', True) else ' with changes'}"
+        for by in (code, *code.get("resumed_by", ()))
+    ]
+    return ", then ".join(names)
+
+
+def made_by() -> dict[str, Any]:
+    """
+    :return: ``versions``, and ``commit`` and ``clean`` within a checkout, for the record of a run
+    """
+    return {"versions": versions(), **commit()}
+
+
+def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """
+    :param before: as of :func:`made_by`
+    :param now: the same, of other code
+    :return: what is not alike, as ``"torch 2.12.0 -> 2.13.0"``
+    """
+    old, new = ({**code.get("versions", {}), "commit": named({**code, "resumed_by": ()})} for code in (before, now))
+    return [
+        f"{name} {old.get(name, 'unknown')} -> {new.get(name, 'none')}"
+        for name in {**old, **new}
+        if old.get(name) != new.get(name)
+    ]

@@ -22,6 +22,7 @@ from helpers.runs import run_folder
 from sb3_htr import PEARL
 from sb3_htr.common.checkpoint import write_checkpoint
 from sb3_htr.common.resume import checkpoints
+from sb3_htr.common.versions import named
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run.shipped import hyperparams_file
 
@@ -300,3 +301,21 @@ def test_changed_settings_and_extra_arguments_are_refused(unbroken: Path, tmp_pa
     (run / "run.json").write_text(json.dumps(record))
     with pytest.raises(ValueError, match=r"hyperparameters \['gamma'\] have changed"):
         main(["train", "--resume", str(run)])
+
+
+def test_a_run_that_goes_on_with_other_code_says_so(unbroken: Path, tmp_path: Path) -> None:
+    """Defaults are of the code. And what is told of the run tells of both, however often it goes on."""
+    run = cut_off(unbroken, tmp_path)
+    record = json.loads((run / "run.json").read_text())
+    before = {**record, "commit": "0123456789", "clean": True, "versions": {**record["versions"], "torch": "1.0"}}
+    (run / "run.json").write_text(json.dumps(before))
+    with pytest.warns(UserWarning, match=r"other code .*torch 1\.0 -> .*commit 0123456789 -> "):
+        assert main(["train", "--resume", str(run)]) == 0
+    (resumed,) = json.loads((run / "run.json").read_text())["resumed_by"]
+    assert resumed["from"] == 2160
+    assert resumed["versions"] == record["versions"]
+    again = cut_off(run, tmp_path / "again")
+    assert main(["train", "--resume", str(again)]) == 0
+    after = json.loads((again / "run.json").read_text())
+    assert after == {**before, "resumed_by": [resumed]}
+    assert named(after) == f"{named(before)}, then {named(record)}"

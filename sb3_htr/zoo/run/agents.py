@@ -168,7 +168,9 @@ def read_record(path: Path, content: bytes | None = None) -> dict[str, Any]:
         record = json.loads(path.read_bytes() if content is None else content)
         given = {name: kind for name, kind in OF_TRAINING.items() if name in record}
         texts = *record["gym_packages"], *record.get("arguments", ())
+        code = record, *record.get("resumed_by", ())
         kinds_are_right = all(type(record[name]) is kind for name, kind in {**REQUIRED, **given}.items())
+        kinds_are_right &= all(type(by.get("versions", {})) is dict for by in code)
         if kinds_are_right and all(isinstance(text, str) for text in texts):
             return cast(dict[str, Any], record)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):

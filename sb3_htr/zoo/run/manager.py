@@ -7,6 +7,7 @@ import shutil
 import signal
 import sys
 import threading
+import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
@@ -36,7 +37,7 @@ from sb3_htr.common.checks import check_keywords, check_numbers, keywords_of
 from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.resume import CheckpointCallback, checkpoints, cut_monitor_files, load_latest
 from sb3_htr.common.vec_env import make_task_vec_env
-from sb3_htr.common.versions import commit, versions
+from sb3_htr.common.versions import differences, made_by
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.pearl.pearl import PEARL
@@ -326,8 +327,21 @@ class MetaExperimentManager(ExperimentManager):
                     f"The hyperparameters {changed} have changed since {self.resumed} was begun: a run goes on with the "
                     "settings that it has. Restore the YAML file, or begin a new run."
                 )
+            going_on = dict(record)
             if is_longer:
-                self._write_record({**record, "n_timesteps": self.n_timesteps, "arguments": sys.argv[1:], "hyperparams": now})
+                going_on |= {"n_timesteps": self.n_timesteps, "arguments": sys.argv[1:], "hyperparams": now}
+            # Defaults are of the code, so what is not in the hyperparameters may be another from here on
+            resumed_by, code = record.get("resumed_by", []), made_by()
+            if other := differences([record, *resumed_by][-1], code):
+                steps = self._checkpoint["model"]["counters"]["num_timesteps"]
+                going_on["resumed_by"] = [*resumed_by, {"from": steps, **code}]
+                warnings.warn(
+                    f"{self.resumed} goes on with other code ({', '.join(other)}), whose defaults may be others, so it need "
+                    "not end as it would have. Its run.json names both from now on.",
+                    stacklevel=2,
+                )
+            if going_on != record:
+                self._write_record(going_on)
             return
         super()._save_config(saved_hyperparams)
         run = {
@@ -340,8 +354,7 @@ class MetaExperimentManager(ExperimentManager):
             "command": " ".join(sys.argv),
             "arguments": sys.argv[1:],
             "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-            "versions": versions(),
-            **commit(),
+            **made_by(),
             "hyperparams": used,
         }
         self._write_record(run)
