@@ -9,6 +9,7 @@ from typing import Any, cast
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from gymnasium import spaces
 from gymnasium.error import DependencyNotInstalled
 from gymnasium.wrappers import FlattenObservation, FrameStackObservation, RescaleObservation, TransformObservation
@@ -608,6 +609,17 @@ def test_a_model_file_that_is_not_there_is_not_damaged(tiny_pearl: MakePEARL, tm
     assert load_untrusted(tmp_path / "model", ENV_ID).policy.latent_dim == 3
     with pytest.raises(FileNotFoundError):
         load_untrusted(tmp_path / "nothing", ENV_ID)
+
+
+@pytest.mark.skipif(th.cuda.is_available(), reason="of a machine without GPU")
+def test_a_gpu_that_is_not_there_is_not_replaced_in_silence(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    """SB3 takes the CPU and says nothing."""
+    with pytest.warns(UserWarning, match="There is no cuda that torch could use: cpu is used"):
+        tiny_pearl(device="cuda").save(tmp_path / "model")
+    with pytest.warns(UserWarning, match="There is no cuda:1 that torch could use: cpu is used"):
+        PEARL.load(tmp_path / "model", device="cuda:1")
+    with pytest.raises(ValueError, match="The device 'gpu' cannot be used: give cpu, cuda or cuda:N"):
+        tiny_pearl(device="gpu")
 
 
 def test_a_hindsight_task_that_its_step_does_not_solve_is_named(

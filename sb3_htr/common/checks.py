@@ -4,12 +4,15 @@ import difflib
 import hashlib
 import inspect
 import re
+import warnings
 from collections.abc import Callable, Iterable
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_htr.common.type_aliases import TaskFamily
@@ -303,3 +306,19 @@ def check_tasks(env: VecEnv, asked: np.ndarray) -> None:
         given = np.stack(env.get_attr("task"))
         if given.shape != asked.shape or not np.allclose(given, asked, rtol=1e-5, atol=1e-6):
             raise ValueError(f"The env was asked for the task {asked[0]}, and is on {given[0]}: {OPTIONS}")
+
+
+def check_device(device: th.device | str) -> None:
+    """
+    Say so where SB3 takes the CPU in place of a GPU that was asked for.
+
+    :param device: torch device, or ``"auto"``
+    :raises ValueError: for a device that cannot be used
+    """
+    try:
+        used = get_device(device)
+        th.empty(0, device=used)
+    except (RuntimeError, AssertionError, NotImplementedError):
+        raise ValueError(f"The device {str(device)!r} cannot be used: give cpu, cuda or cuda:N.") from None
+    if device != "auto" and th.device(device).type != used.type:
+        warnings.warn(f"There is no {device} that torch could use: {used} is used.", stacklevel=3)

@@ -97,6 +97,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         seed: int | None,
         **kwargs: Any,
     ) -> None:
+        checks.check_device(kwargs.get("device", "auto"))
         checks.check_numbers(n_tasks_per_rollout=(n_tasks_per_rollout, 1, float("inf")))
         self.explorer, self.train_explorer = to_explorer(explorer), to_explorer(train_explorer)
         buffer_class = replay_buffer_class or MultiTaskReplayBuffer

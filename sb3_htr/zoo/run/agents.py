@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Any, cast
 
 import gymnasium as gym
-import torch as th
 from rl_zoo3.utils import get_wrapper_class
-from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv
 
 import htr_envs  # noqa: F401 registers the envs
+from sb3_htr.common.checks import check_device
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.zoo.run.algorithm import Algorithm, Model
 from sb3_htr.zoo.run.folder import run_number
@@ -80,10 +79,7 @@ class TrainedAgent:
         :return: the model
         :raises ValueError: for a device that cannot be used, or a model whose networks are not those of this version
         """
-        try:
-            th.empty(0, device=get_device(device))
-        except (RuntimeError, AssertionError, NotImplementedError):
-            raise ValueError(f"The device {device!r} cannot be used: give cpu, cuda or cuda:N.") from None
+        check_device(device)
         try:
             return self.algorithm.load(self.path, self.record, self.make_env(), device, self.trusted)
         except RuntimeError as error:
