@@ -197,7 +197,7 @@ ALL = (
         POINT,
         150_000,
         tuple(Variant(method, settings=settings_of("pearl_prior.yml")) for method in ("htr-ser-prior", "pearl-dense-prior")),
-        evaluations=by(("prior", "belief")),
+        evaluations=by(("prior", "prior, 10 exploration episodes", "belief")),
     ),
     Experiment(
         "ablation",

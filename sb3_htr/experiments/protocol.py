@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from sb3_htr.adaptation.evaluation import evaluate_adaptation
-from sb3_htr.adaptation.explorers import to_explorer
+from sb3_htr.adaptation.explorers import Explorer, Prior, to_explorer
 from sb3_htr.adaptation.first_success import first_success
 from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.vec_env import make_task_vec_env
@@ -18,6 +18,8 @@ from sb3_htr.zoo.run.method import OWN
 
 # A final model adapts to all test tasks once for each: of starting states, and of all that an explorer draws
 EVAL_SEEDS = (1, 2, 3, 4, 5)
+# Explorers that only experiments have a name for
+EXPERIMENTAL: dict[str, Explorer] = {**ABLATIONS, "prior, 10 exploration episodes": Prior(n_exploration_episodes=10)}
 # A table of fewer says so
 MIN_RUNS = 5
 # Of the validation tasks, when a family counts as learned
@@ -50,8 +52,8 @@ def evaluate(cell: Cell, model: Model, trained_with: Any = None) -> KwArgs:
 
 
 def _explorer(name: str, trained_with: Any) -> Any:
-    if name in ABLATIONS or name == OWN:
-        return ABLATIONS.get(name, name)
+    if name in EXPERIMENTAL or name == OWN:
+        return EXPERIMENTAL.get(name, name)
     is_meant = isinstance(trained_with, Mapping) and trained_with.get("name") == name
     return to_explorer(trained_with if is_meant else name)
 
