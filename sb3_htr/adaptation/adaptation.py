@@ -77,6 +77,7 @@ class Adaptation:
         self._running: list[np.ndarray] = []
         self._n_steps = np.zeros(n_envs, dtype=np.int64)
         self._state = policy.encoder.empty(n_envs)
+        self._watch = knowledge.watch(n_envs)
         self.explorer = explorer.begin(self)
 
     @property
@@ -157,6 +158,8 @@ class Adaptation:
             )
             task_free = policy.reward_model.task_free(policy.normalize(obs), action, policy.normalize(next_obs))
         beside = step.rewards - task_free.cpu().numpy()
+        if self._watch is not None:
+            self._watch.check(beside, np.asarray(step.dones))
         return np.where(beside > self.knowledge.threshold.item(), beside, 0.0)
 
     def _remember(self, *columns: np.ndarray) -> None:

@@ -7,6 +7,7 @@ import torch as th
 from torch import nn
 
 from sb3_htr.adaptation.policy import ContextualPolicy
+from sb3_htr.adaptation.reward_watch import RewardWatch
 from sb3_htr.adaptation.task_bank import MAX_HINDSIGHT_TASKS, MAX_TRAIN_TASKS, TaskBank
 from sb3_htr.common.type_aliases import Context
 
@@ -76,6 +77,17 @@ class LatentKnowledge(nn.Module):
     def tells_success(self) -> bool:
         """Whether some rewards tell a success. In a family that has no successes, none does: the threshold is infinite."""
         return bool(self.threshold < float("inf"))
+
+    def watch(self, n_envs: int) -> RewardWatch | None:
+        """
+        :param n_envs: number of envs of an adaptation
+        :return: what notices rewards unlike those of meta-training; None if no task was solved there by which one could
+        """
+        n, threshold = int(self.n_particles), self.threshold.item()
+        if not self.tells_success or n == 0:
+            return None
+        # The threshold is in the middle, and is known before the model of rewards has learned what a success is worth
+        return RewardWatch(n_envs, threshold, max(2 * threshold, self.gain[:n, :n].max().item()))
 
     def set_tells_success(self, tells_success: bool) -> None:
         """

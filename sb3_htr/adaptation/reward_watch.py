@@ -1,0 +1,50 @@
+"""Notices at meta-test that rewards are given otherwise than in meta-training."""
+
+import warnings
+
+import numpy as np
+
+# Times what a success is worth: that of one step may be more than their mean, but not by so much
+LARGER = 5.0
+
+
+class RewardWatch:
+    """
+    Warns once of rewards that are too large, and once of those by which nothing can be told for a success.
+
+    A goal that is reached for 0 in place of -1 is such a one: the agent would take all that it does for a failure.
+
+    :param n_envs: number of envs
+    :param threshold: above which a step is taken for a success, by what it returns beside what the model says of steps without
+    :param worth: largest reward that is known of a success, likewise
+    """
+
+    def __init__(self, n_envs: int, threshold: float, worth: float) -> None:
+        self._threshold = threshold
+        self._worth = worth
+        self._sum = np.zeros(n_envs)
+        self._n_steps = np.zeros(n_envs, dtype=np.int64)
+        self._warned: set[str] = set()
+
+    def check(self, beside: np.ndarray, dones: np.ndarray) -> None:
+        """
+        :param beside: (n_envs,), what a step of each env returned beside what the model says of steps without success
+        :param dones: (n_envs,) bool, where an episode ended
+        """
+        if (largest := beside.max()) > LARGER * self._worth:
+            self._warn("A step", largest, f"up to about {self._worth:.2g}")
+        self._sum += beside
+        self._n_steps += 1
+        if dones.any():
+            if (lowest := (self._sum[dones] / self._n_steps[dones]).min()) < -self._threshold:
+                self._warn("On average, the steps of an episode", lowest, f"about 0, and a success up to {self._worth:.2g}")
+            self._sum[dones] = self._n_steps[dones] = 0
+
+    def _warn(self, what: str, value: float, expected: str) -> None:
+        if what not in self._warned:
+            self._warned.add(what)
+            warnings.warn(
+                f"{what} returned {value:.2g} more than meta-training has taught of steps without success, expected "
+                f"{expected}: give rewards as in meta-training, or the agent cannot make sense of them.",
+                stacklevel=5,
+            )
