@@ -228,4 +228,4 @@ def reliability(results: Results, path: Path) -> None:
         axes.plot(probability / n, successes / n, "o-", color=colour, markersize=4, label=label)
     axes.set_xlabel("probability of success by the reward model")
     axes.set_ylabel("frequency of success")
-    finish(figure, path, f"{next(iter(results)).env_id}: states and validation tasks of {n_seeds(results)} seeds")
+    finish(figure, path, f"{next(iter(results)).env_id}: states and validation tasks of {n_seeds(results)} seeds", 1)

@@ -30,17 +30,18 @@ def band(axes: plt.Axes, x: np.ndarray, scores: np.ndarray, colour: str, style: 
     axes.fill_between(x, points[:, 1], points[:, 2], color=colour, alpha=0.2, linewidth=0)
 
 
-def finish(figure: Figure, path: Path, title: str) -> None:
+def finish(figure: Figure, path: Path, title: str, legend_columns: int = 2) -> None:
     """
     :param figure: to make alike all others, and to save
     :param path: picture to write
     :param title: of the figure
+    :param legend_columns: one for labels so long that two beside each other would narrow the axes
     """
     for axes in figure.axes:
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.25)
         if axes.get_legend_handles_labels()[0]:
-            axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=2)
+            axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=legend_columns)
     figure.suptitle(title, fontsize=11)
     save(figure, path)
 
