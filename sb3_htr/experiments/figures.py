@@ -13,7 +13,7 @@ from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.protocol import scores
 from sb3_htr.zoo.plots.curves import band, finish
 from sb3_htr.zoo.plots.intervals import iqm_interval
-from sb3_htr.zoo.plots.style import COLOURS, curve_styles, save
+from sb3_htr.zoo.plots.style import COLOURS, curve_colours, save
 
 Results = dict[Cell, Path]
 
@@ -62,7 +62,7 @@ def learning(results: Results, path: Path) -> None:
     """
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
     groups = by_variant(results)
-    for (colour, _), (variant, runs) in zip(curve_styles([*groups]), groups.items(), strict=True):
+    for colour, (variant, runs) in zip(curve_colours([*groups]), groups.items(), strict=True):
         curve = np.stack([raw["curve"].mean(axis=1) for _, raw in runs])
         band(left, runs[0][1]["timesteps"] / 1000, curve, colour, "-", label(variant, runs, results))
         explorers = [evaluation.explorer for evaluation in runs[0][0].evaluations if not evaluation.tested_on]
@@ -91,7 +91,7 @@ def race(results: Results, path: Path) -> None:
     """
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained", sharey=True)
     groups = by_variant(results)
-    for (colour, _), (variant, runs) in zip(curve_styles([*groups]), groups.items(), strict=True):
+    for colour, (variant, runs) in zip(curve_colours([*groups]), groups.items(), strict=True):
         solved = np.stack([100 * raw["solved"].mean(axis=1) for _, raw in runs])
         name = f"{label(variant, runs, results)}, {runs[0][0].evaluations[0].explorer}"
         band(left, runs[0][1]["timesteps"] / 1000, solved, colour, "-", name)
@@ -131,7 +131,7 @@ def goal_distance(results: Results, path: Path) -> None:
     """
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
     groups = by_variant(results, and_env=False)
-    for (colour, _), (variant, runs) in zip(curve_styles([*groups]), groups.items(), strict=True):
+    for colour, (variant, runs) in zip(curve_colours([*groups]), groups.items(), strict=True):
         x = sorted({cell.env_kwargs["goal_distance"] for cell, _ in runs})
         ordered = sorted(runs, key=lambda run: (run[0].env_kwargs["goal_distance"], run[0].seed))
         optimum = [optimal_return(**cell.env_kwargs) for cell, _ in ordered]
@@ -171,7 +171,7 @@ def relabelling(results: Results, path: Path) -> None:
     left.set_ylabel("return of the last adaptation episode")
     left.set_title("test tasks, final models", fontsize=10)
     shown = [variant for variant in groups if variant == "K = 0.8" or not variant.startswith("K = ")]
-    for (colour, _), variant in zip(curve_styles(shown), shown, strict=True):
+    for colour, variant in zip(curve_colours(shown), shown, strict=True):
         curve = np.stack([run["curve"].mean(axis=1) for run in groups[variant]])
         band(right, groups[variant][0]["timesteps"] / 1000, curve, colour, "-", variant)
     right.set_xlabel("thousand env steps of meta-training")
@@ -219,7 +219,7 @@ def reliability(results: Results, path: Path) -> None:
     figure, axes = plt.subplots(figsize=(4.8, 4.4), layout="constrained")
     axes.plot([0, 1], [0, 1], color=COLOURS[6], linewidth=1)
     groups = by_variant(results)
-    for (colour, _), (variant, runs) in zip(curve_styles([*groups]), groups.items(), strict=True):
+    for colour, (variant, runs) in zip(curve_colours([*groups]), groups.items(), strict=True):
         bins = np.sum([raw["calibration"] for _, raw in runs], axis=0)
         if not bins.any():
             continue

@@ -18,7 +18,7 @@ from sb3_htr.adaptation.evaluation import AdaptationRecord
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.commands.plot import check_same_settings
 from sb3_htr.zoo.plots import adaptation, curves, style
-from sb3_htr.zoo.plots.style import curve_styles
+from sb3_htr.zoo.plots.style import curve_colours, curve_styles
 from sb3_htr.zoo.run.method import methods
 
 
@@ -105,6 +105,16 @@ def test_a_method_has_one_colour_in_all_pictures() -> None:
         assert again == own != other
         first, second = curve_styles([name, name])
         assert first == own != second, "two settings of one method are told apart"
+
+
+def test_where_lines_tell_something_else_no_two_methods_have_one_colour() -> None:
+    own = {name: colour for name, (colour, _) in zip(methods(), curve_styles(list(methods())), strict=True)}
+    names = ["htr-ser", "htr-ec", "pearl-dense", "pearl-sparse", "pearl-sparse-prior"]
+    colours = curve_colours(names)
+    assert len(set(colours)) == len(names)
+    assert colours[:4] == [own[name] for name in names[:4]]
+    alone = ["htr-ser-prior", "pearl-dense-prior"]
+    assert curve_colours(alone) == [own[name] for name in alone]
 
 
 @pytest.mark.parametrize(("kind", "begin"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")])

@@ -32,6 +32,23 @@ def curve_styles(names: Sequence[str]) -> list[tuple[str, str]]:
     return [own_styles[name] if is_first else next(left) for name, is_first in zip(names, first, strict=True)]
 
 
+def curve_colours(names: Sequence[str]) -> list[str]:
+    """
+    :param names: what the curves of a picture are of, whose lines tell something else
+    :return: colour of each: that of its method, but no two alike as long as there are colours
+    """
+    styles = curve_styles(names)
+    taken = [colour for colour, line in styles if line == "-"]
+    colours = []
+    for colour, line in styles:
+        if line != "-":
+            if colour in taken:
+                colour = next((free for free in COLOURS if free not in taken), colour)
+            taken.append(colour)
+        colours.append(colour)
+    return colours
+
+
 def save(figure: plt.Figure, path: Path) -> None:
     """
     :param figure: to save and close
