@@ -214,13 +214,15 @@ def reliability(results: Results, path: Path) -> None:
     Frequency of success against its probability by the reward model, on validation tasks.
 
     :param results: raw results of the cells
-    :param path: picture to write
+    :param path: picture to write, if there is such a model: a family without successes has none, as have some rivals
     """
+    variants = by_variant(results).items()
+    groups = {variant: np.sum([raw["calibration"] for _, raw in runs], axis=0) for variant, runs in variants}
+    if not any(bins.any() for bins in groups.values()):
+        return
     figure, axes = plt.subplots(figsize=(4.8, 4.4), layout="constrained")
     axes.plot([0, 1], [0, 1], color=COLOURS[6], linewidth=1)
-    groups = by_variant(results)
-    for colour, (variant, runs) in zip(curve_colours([*groups]), groups.items(), strict=True):
-        bins = np.sum([raw["calibration"] for _, raw in runs], axis=0)
+    for colour, (variant, bins) in zip(curve_colours([*groups]), groups.items(), strict=True):
         if not bins.any():
             continue
         n, probability, successes = bins[bins[:, 0] > 0].T

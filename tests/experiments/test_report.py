@@ -39,6 +39,13 @@ def made_up(cells: list[Cell], folder: Path) -> dict[Cell, Path]:
     return results
 
 
+def test_without_successes_no_picture_says_how_well_they_are_predicted(tmp_path: Path) -> None:
+    (cell, path), *_ = made_up(EXPERIMENTS["point_maze"].cells(1), tmp_path).items()
+    np.savez(path, **{**np.load(path), "calibration": np.zeros((10, 3))})
+    figures.reliability({cell: path}, tmp_path / "reliability.png")
+    assert not (tmp_path / "reliability.png").exists()
+
+
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     experiment, folder = EXPERIMENTS[name], tmp_path / "results"
