@@ -44,6 +44,7 @@ class Adaptation:
     :param knowledge: what meta-training knows about z
     :param explorer: chooses z; not changed, this adaptation has a copy of its own, :attr:`explorer`
     :param n_envs: number of tasks
+    :param gamma: discount of the critics' values
     :param context_size: steps of an episode that the posterior is inferred from, evenly spread, at most: as many as in
         meta-training, because each narrows it
     :param generator: source of randomness; torch's global one by default
@@ -57,6 +58,7 @@ class Adaptation:
         knowledge: LatentKnowledge,
         explorer: Explorer,
         n_envs: int,
+        gamma: float,
         context_size: int,
         generator: th.Generator | None = None,
         is_training: bool = False,
@@ -64,6 +66,7 @@ class Adaptation:
         self.policy = policy
         self.knowledge = knowledge
         self.n_envs = n_envs
+        self.gamma = gamma
         self.context_size = context_size
         self.generator = generator
         self.is_training = is_training

@@ -440,7 +440,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         chosen = self.explorer if explorer in (None, self.explorer.name) else to_explorer(explorer)
         self._check_explorer(chosen)
         checks.check_numbers(n_envs=(n_envs, 1, float("inf")))
-        return Adaptation(self.policy, self.knowledge, chosen, n_envs, self.context_size, generator, is_training)
+        return Adaptation(self.policy, self.knowledge, chosen, n_envs, self.gamma, self.context_size, generator, is_training)
 
     def adapt(
         self,

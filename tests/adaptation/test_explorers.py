@@ -260,6 +260,28 @@ def test_the_posterior_of_a_better_episode_is_tried_once(tiny_pearl: MakePEARL) 
     assert (z[2] != mean).any() and (z[3] != mean).any()
 
 
+@pytest.mark.parametrize(("growth", "turns"), [(1.0, True), (1 / 0.9, False)])
+def test_an_episode_whose_value_does_not_grow_searches_on(
+    tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch, growth: float, turns: bool
+) -> None:
+    """A z that was good may lead nowhere from where this one begins. On the way to a reward, values grow by 1 / gamma."""
+    model = tiny_pearl(gamma=0.9)
+    know_tasks(model, 8)
+    values = [1.0]
+    monkeypatch.setattr(model.policy, "values", lambda obs, z: th.full(z.shape[:2], values[0]))
+    adaptation = begin(model, "belief")
+    found = play(adaptation, [[5.0], [5.0], [5.0]])[-1]
+    z = []
+    for i in range(20):
+        adaptation.explorer.look(np.zeros((1, 2), dtype=np.float32))
+        z.append(adaptation.z[0].copy())
+        adaptation.observe(step([[found[0, 0], 0.0]], [0.0], i == 19))
+        values[0] *= growth
+    assert (np.asarray(z) != z[0]).any() == turns
+    assert (np.asarray(z[:7]) == z[0]).all(), "0.9 ** 6 of a promise is more than half of it"
+    np.testing.assert_array_equal(adaptation.explorer.final_z()[0], z[0])
+
+
 @pytest.mark.parametrize("explorer", ["belief", "aggregate", "prior", "learned-prior"])
 def test_nothing_but_observations_actions_and_rewards_is_used(tiny_pearl: MakePEARL, explorer: str) -> None:
     """What infos say makes no difference, and neither does whether they say anything."""

@@ -21,6 +21,9 @@ N_CHOICES = 40
 MIN_VALUE = 1e-3
 # Of what was found, what an episode with one z must return to end the search
 REPEATED = 0.5
+# Of what the critics promised at its start, what they must still promise in an unrewarded episode, or it searches on. By
+# measurement, docs/pearl.md, item 23
+KEPT = 0.5
 
 
 @dataclass
@@ -33,7 +36,8 @@ class Belief(ParticleExplorer):
     within an episode. What several z found cannot be repeated: every other episode searches, until one with a single z has
     returned half as much. The others have a single z, the one that promises the largest return: of a particle, under the same
     belief; of the best episode so far, what it returned. The encoder's posterior mean, given a new best episode, is tried
-    once.
+    once. Where an episode begins elsewhere each time, a z that was good may be a bad one: an episode that is not rewarded and
+    whose value, as it goes on, is not what it was at the start, searches on.
 
     :param margin: a particle must promise so many times what the best episode returned, to be tried in its place
     """
@@ -54,6 +58,8 @@ class Belief(ParticleExplorer):
         self._n_steps = np.zeros(n_envs, dtype=np.int64)
         # Steps from one choice within an episode to the next
         self._every = np.ones(n_envs, dtype=np.int64)
+        # Value of acting with the only z of the running episode, at its start
+        self._promised = np.zeros(n_envs)
         # Of all episodes, and of those with one z
         self._best_return = np.zeros(n_envs)
         self._best_z = np.zeros_like(self.z)
@@ -80,8 +86,10 @@ class Belief(ParticleExplorer):
         search = unsure & (self.exploring() | ~self._searching)
         self._searching = np.where(self._at_start, search, self._searching)
         due = self._at_start | (self._n_steps % self._every == 0)
+        self._exploit(np.flatnonzero(~self._searching & self._at_start), obs)
+        unrewarded = ~self._at_start & (self.adaptation.episode_return <= 0)
+        self._give_up(np.flatnonzero(~self._searching & due & unrewarded), obs)
         self._search(np.flatnonzero(self._searching & due), obs)
-        self._exploit(np.flatnonzero(~self._searching & self._at_start))
         self._at_start[:] = False
 
     def _search(self, envs: np.ndarray, obs: np.ndarray) -> None:
@@ -105,7 +113,7 @@ class Belief(ParticleExplorer):
         promise = gain * beside.clamp(min=MIN_VALUE)
         return z[th.arange(len(envs)), promise.argmax(dim=1)]
 
-    def _exploit(self, envs: np.ndarray) -> None:
+    def _exploit(self, envs: np.ndarray, obs: np.ndarray) -> None:
         """What returns most."""
         if len(envs) == 0:
             return
@@ -118,6 +126,23 @@ class Belief(ParticleExplorer):
         proposed = envs[self._has_proposal[envs]]
         self.z[proposed], self._particle[proposed] = self._proposal[proposed], -1
         self._has_proposal[proposed] = False
+        self._promised[envs] = self._values(envs, obs)
+
+    def _give_up(self, envs: np.ndarray, obs: np.ndarray) -> None:
+        """Until a reward comes, the value of going there grows by 1 / gamma a step. Where it does not, something is wrong."""
+        if len(envs) == 0:
+            return
+        kept = self.adaptation.gamma ** self._n_steps[envs] * self._values(envs, obs)
+        promised = self._promised[envs]
+        self._searching[envs] = (promised > MIN_VALUE) & (kept < KEPT * promised)
+
+    def _values(self, envs: np.ndarray, obs: np.ndarray) -> np.ndarray:
+        """(k,), of going on with z."""
+        policy, knowledge = self.adaptation.policy, self.adaptation.knowledge
+        with th.no_grad():
+            z = th.as_tensor(self.z[envs], device=policy.device)[:, None]
+            values = policy.values(obs[envs], z)[:, 0] - knowledge.task_free_value
+        return np.asarray(values.cpu().numpy())
 
     def observe(self, step: "Step") -> None:
         self.infer(step)
