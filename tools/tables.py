@@ -36,20 +36,26 @@ def columns(summary: dict[str, Any]) -> dict[str, str]:
 def table(summary: dict[str, Any]) -> str:
     """
     :param summary: content of a ``summary.json``
-    :return: Markdown table, one line per env argument, method and explorer
+    :return: Markdown table, one line per env argument, method and explorer; tasks unlike those of training have a column each
     """
     rows = summary["rows"]
-    lines: dict[tuple[str, ...], dict[str, str]] = {}
+    lines: dict[tuple[str, ...], dict[str, dict[str, dict[str, Any]]]] = {}
     settings = sorted({key for row in rows for key in row["env_kwargs"]})
-    has_places = any(row.get("tested_on") for row in rows)
     for row in rows:
-        place = [_place(row)] if has_places else []
-        key = (*(str(row["env_kwargs"][setting]) for setting in settings), row["variant"], f"`{row['explorer']}`", *place)
-        lines.setdefault(key, {})[row["metric"]] = f"{row['iqm']:.2f} [{row['low']:.2f}, {row['high']:.2f}]"
+        key = (*(str(row["env_kwargs"][setting]) for setting in settings), row["variant"], f"`{row['explorer']}`")
+        lines.setdefault(key, {}).setdefault(_place(row), {})[row["metric"]] = row
     settings = [setting.replace("_", " ") for setting in settings]
     shown = columns(summary)
-    head = [*settings, "method", "explorer", *["tested on"] * has_places, *shown.values()]
-    body = [[*key, *(cells[metric] for metric in shown)] for key, cells in lines.items()]
+    elsewhere = [place for place in dict.fromkeys(map(_place, rows)) if place]
+    head = [*settings, "method", "explorer", *shown.values(), *(f"{place}: return, solved" for place in elsewhere)]
+    body = [
+        [
+            *key,
+            *(_score(places.get("", {}), metric) for metric in shown),
+            *(_both(places.get(place, {})) for place in elsewhere),
+        ]
+        for key, places in lines.items()
+    ]
     env_steps = " / ".join(f"{n:,}" for n in sorted({row["env_steps"] for row in rows}))
     about = f"{rows[0]['env']}, {env_steps} env steps, {_runs(rows)}."
     later = summary.get("evaluation_commit", summary["commit"])
@@ -60,6 +66,18 @@ def table(summary: dict[str, Any]) -> str:
         f"95 % bootstrap interval over runs, tasks and {summary.get('n_eval_seeds', 1)} evaluation seeds. "
         f"`{summary['command']}`, commit {commits}, {summary['machine']}.\n"
     )
+
+
+def _score(rows: dict[str, dict[str, Any]], metric: str) -> str:
+    if metric not in rows:
+        return ""
+    row = rows[metric]
+    return f"{row['iqm']:.2f} [{row['low']:.2f}, {row['high']:.2f}]"
+
+
+def _both(rows: dict[str, dict[str, Any]]) -> str:
+    """Return with its interval, and tasks solved."""
+    return f"{_score(rows, 'last_episode_return')}, {rows['success_rate']['iqm']:.2f}" if rows else ""
 
 
 def _runs(rows: list[dict[str, Any]]) -> str:
@@ -74,8 +92,8 @@ def _runs(rows: list[dict[str, Any]]) -> str:
 
 
 def _place(row: dict[str, Any]) -> str:
-    """What env a model was tested on."""
-    return ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in row.get("tested_on", {}).items()) or "as in training"
+    """What env a model was tested on, other than in training; empty if it was that."""
+    return ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in row.get("tested_on", {}).items())
 
 
 def headline(summaries: dict[str, dict[str, Any]]) -> str:

@@ -48,6 +48,14 @@ class NoValue(Belief):
 
 
 @dataclass
+class NoGivingUp(Belief):
+    """After the first reward, an episode acts with one z to its end, whatever the critics say of it."""
+
+    def give_up(self, envs: np.ndarray, obs: np.ndarray) -> None:
+        pass
+
+
+@dataclass
 class NoInference(Belief):
     """What the reward model says of rewards is ignored: the belief stays as it was beforehand."""
 
@@ -60,5 +68,6 @@ ABLATIONS: dict[str, Explorer] = {
     "belief, uniform prior": UniformPrior(),
     "belief, no posterior": NoPosterior(),
     "belief, no value": NoValue(),
+    "belief, no giving up": NoGivingUp(),
     "belief, no inference": NoInference(),
 }

@@ -12,7 +12,9 @@ from helpers import ENV_ID, MakePEARL
 from helpers.adaptations import begin, know_tasks, play, step, walk
 from sb3_htr import PEARL
 from sb3_htr.adaptation import Aggregate, Belief, LearnedPrior
+from sb3_htr.adaptation.explorers import Explorer
 from sb3_htr.common.type_aliases import Context
+from sb3_htr.experiments.ablations import ABLATIONS
 
 SETBACKS = Aggregate().max_setbacks
 
@@ -260,16 +262,19 @@ def test_the_posterior_of_a_better_episode_is_tried_once(tiny_pearl: MakePEARL) 
     assert (z[2] != mean).any() and (z[3] != mean).any()
 
 
-@pytest.mark.parametrize(("growth", "turns"), [(1.0, True), (1 / 0.9, False)])
+@pytest.mark.parametrize(
+    ("explorer", "growth", "turns"),
+    [("belief", 1.0, True), ("belief", 1 / 0.9, False), (ABLATIONS["belief, no giving up"], 1.0, False)],
+)
 def test_an_episode_whose_value_does_not_grow_searches_on(
-    tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch, growth: float, turns: bool
+    tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch, explorer: str | Explorer, growth: float, turns: bool
 ) -> None:
     """A z that was good may lead nowhere from where this one begins. On the way to a reward, values grow by 1 / gamma."""
     model = tiny_pearl(gamma=0.9)
     know_tasks(model, 8)
     values = [1.0]
     monkeypatch.setattr(model.policy, "values", lambda obs, z: th.full(z.shape[:2], values[0]))
-    adaptation = begin(model, "belief")
+    adaptation = begin(model, explorer)
     found = play(adaptation, [[5.0], [5.0], [5.0]])[-1]
     z = []
     for i in range(20):

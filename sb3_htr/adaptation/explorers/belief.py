@@ -88,7 +88,7 @@ class Belief(ParticleExplorer):
         due = self._at_start | (self._n_steps % self._every == 0)
         self._exploit(np.flatnonzero(~self._searching & self._at_start), obs)
         unrewarded = ~self._at_start & (self.adaptation.episode_return <= 0)
-        self._give_up(np.flatnonzero(~self._searching & due & unrewarded), obs)
+        self.give_up(np.flatnonzero(~self._searching & due & unrewarded), obs)
         self._search(np.flatnonzero(self._searching & due), obs)
         self._at_start[:] = False
 
@@ -128,8 +128,13 @@ class Belief(ParticleExplorer):
         self._has_proposal[proposed] = False
         self._promised[envs] = self._values(envs, obs)
 
-    def _give_up(self, envs: np.ndarray, obs: np.ndarray) -> None:
-        """Until a reward comes, the value of going there grows by 1 / gamma a step. Where it does not, something is wrong."""
+    def give_up(self, envs: np.ndarray, obs: np.ndarray) -> None:
+        """
+        Until a reward comes, the value of going there grows by 1 / gamma a step. Where it does not, search.
+
+        :param envs: (k,) int, whose episodes have a single z, and no reward yet
+        :param obs: (n_envs, obs_dim), what is acted on
+        """
         if len(envs) == 0:
             return
         kept = self.adaptation.gamma ** self._n_steps[envs] * self._values(envs, obs)
