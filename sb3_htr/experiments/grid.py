@@ -253,7 +253,7 @@ ALL = (
         eval_freq=100_000,
         evaluations=by(BELIEF),
     ),
-    # By measurement on validation tasks, docs/envs/hidden_goal.md. An evaluation takes 240,000 env steps, so there are few
+    # By measurement on validation tasks, docs/trials.md. An evaluation takes 240,000 env steps, so there are few
     Experiment(
         "point_maze",
         "A point in a maze, its goal hidden.",

@@ -22,7 +22,7 @@ MIN_VALUE = 1e-3
 # Of what was found, what an episode with one z must return to end the search
 REPEATED = 0.5
 # Of what the critics promised at its start, what they must still promise in an unrewarded episode, or it searches on. By
-# measurement, docs/pearl.md, item 23
+# measurement, docs/trials.md
 KEPT = 0.5
 
 

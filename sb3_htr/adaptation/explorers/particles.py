@@ -28,7 +28,7 @@ class ParticleExplorer(Explorer):
     Nothing else is used than observations, actions and rewards.
 
     :param doubt: probability of a success where the model excludes one, and of none where it is sure of one; above 0, so that
-        no reward is impossible. By measurement, docs/pearl.md, item 22
+        no reward is impossible. By measurement, docs/trials.md
     :param temperature: power of each step's likelihood: steps of an episode are not independent
     :param noise: smallest standard deviation of rewards around those expected, relative to the mean reward of a success
     """
