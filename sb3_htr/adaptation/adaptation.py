@@ -58,6 +58,7 @@ class Adaptation:
         knowledge: LatentKnowledge,
         explorer: Explorer,
         n_envs: int,
+        *,
         gamma: float,
         context_size: int,
         generator: th.Generator | None = None,

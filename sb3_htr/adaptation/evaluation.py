@@ -110,7 +110,7 @@ def run_adaptation(
             # Envs that are ahead of the others write to a column that is cut off
             column = np.minimum(episode, n_episodes)
             returns[envs, column] += step.rewards
-            successes[envs, column] |= [info.get("is_success", False) for info in step.infos]
+            successes[envs, column] |= [bool(info.get("is_success", False)) for info in step.infos]
             steps.append(np.array([info.get("achieved_task", ()) for info in step.infos], dtype=np.float32))
             episode_of_step.append(column)
             episode += step.dones

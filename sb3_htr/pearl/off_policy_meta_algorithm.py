@@ -190,6 +190,8 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         checks.check_rewards(env)
         family = checks.get_task_family(env)
         self.max_episode_steps = checks.get_max_episode_steps(env)
+        # What another family left
+        self._task_queue = np.zeros(0, dtype=np.int64)
         buffer_class = cast(type[MultiTaskReplayBuffer], self.replay_buffer_class)
         self.replay_buffer = buffer_class(
             self.buffer_size,
@@ -440,7 +442,16 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         chosen = self.explorer if explorer in (None, self.explorer.name) else to_explorer(explorer)
         self._check_explorer(chosen)
         checks.check_numbers(n_envs=(n_envs, 1, float("inf")))
-        return Adaptation(self.policy, self.knowledge, chosen, n_envs, self.gamma, self.context_size, generator, is_training)
+        return Adaptation(
+            self.policy,
+            self.knowledge,
+            chosen,
+            n_envs,
+            gamma=self.gamma,
+            context_size=self.context_size,
+            generator=generator,
+            is_training=is_training,
+        )
 
     def adapt(
         self,
@@ -504,7 +515,8 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
                         "end its episodes, as in a gymnasium.wrappers.TimeLimit."
                     )
                 returns[episode] += step.rewards[0]
-                successes[episode] |= step.infos[0].get("is_success", adaptation.task_reward[0] > 0)
+                # Some envs give a number
+                successes[episode] |= bool(step.infos[0].get("is_success", adaptation.task_reward[0] > 0))
         if adaptation.best_return[0] <= 0 and self.knowledge.tells_success:
             warnings.warn(
                 f"No reward was found in {n_episodes} episodes, so the agent is not adapted: allow more, or train longer.",

@@ -150,6 +150,19 @@ def test_a_plain_env_without_task_family_and_infos_is_adapted_to_as_well(tiny_pe
         model.adapt(Plain(goal), task=3)
 
 
+class SaysOne(Plain):
+    """Many a GoalEnv has numbers as ``is_success``."""
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        obs, reward, terminated, truncated, _ = super().step(action)
+        return obs, reward, terminated, truncated, {"is_success": 1.0}
+
+
+def test_a_success_may_be_a_number(tiny_pearl: MakePEARL) -> None:
+    with pytest.warns(UserWarning, match="No reward was found"):
+        assert tiny_pearl().adapt(SaysOne(np.array([9.0, 9.0], dtype=np.float32)), 2).successes.all()
+
+
 def test_adapt_says_when_nothing_was_found(tiny_pearl: MakePEARL) -> None:
     with pytest.warns(UserWarning, match="No reward was found in 2 episodes"):
         agent = tiny_pearl().adapt(ENV_ID, n_episodes=2, task=np.array([9.0, 9.0]))

@@ -287,6 +287,28 @@ def test_an_episode_whose_value_does_not_grow_searches_on(
     np.testing.assert_array_equal(adaptation.explorer.final_z()[0], z[0])
 
 
+@pytest.mark.parametrize("explorer", ["belief", ABLATIONS["belief, no giving up"]])
+def test_every_other_episode_searches_whether_one_between_was_given_up_or_not(
+    tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch, explorer: str | Explorer
+) -> None:
+    model = tiny_pearl(gamma=0.9)
+    know_tasks(model, 8)
+    values = [1.0]
+    monkeypatch.setattr(model.policy, "values", lambda obs, z: th.full(z.shape[:2], values[0]))
+    adaptation, searching = begin(model, explorer), []
+    for episode in range(7):
+        for i in range(6):
+            adaptation.explorer.look(np.zeros((1, 2), dtype=np.float32))
+            if i == 0:
+                assert isinstance(adaptation.explorer, Belief)
+                searching.append(bool(adaptation.explorer._searching[0]))
+            found = 9.0 * (episode == 0 and i == 5)
+            adaptation.observe(step([[adaptation.z[0, 0], 0.0]], [found], i == 5))
+            values[0] *= 0.6
+        values[0] = 1.0
+    assert searching == [True, False] * 3 + [True]
+
+
 @pytest.mark.parametrize("explorer", ["belief", "aggregate", "prior", "learned-prior"])
 def test_nothing_but_observations_actions_and_rewards_is_used(tiny_pearl: MakePEARL, explorer: str) -> None:
     """What infos say makes no difference, and neither does whether they say anything."""

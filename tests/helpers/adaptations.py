@@ -57,7 +57,15 @@ class _FirstColumn(th.nn.Module):
 def begin(model: PEARL, explorer: Any, n_envs: int = 1, context_size: int = 64) -> Adaptation:
     """An adaptation, always of the same seed."""
     generator = th.Generator().manual_seed(0)
-    return Adaptation(model.policy, model.knowledge, to_explorer(explorer), n_envs, model.gamma, context_size, generator)
+    return Adaptation(
+        model.policy,
+        model.knowledge,
+        to_explorer(explorer),
+        n_envs,
+        gamma=model.gamma,
+        context_size=context_size,
+        generator=generator,
+    )
 
 
 def step(obs: Any, rewards: Any, ended: Any, actions: Any = None) -> Step:

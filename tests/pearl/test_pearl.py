@@ -301,6 +301,17 @@ def test_loading_for_prediction_stores_nothing_and_an_env_can_come_later(tiny_pe
     loaded.learn(ROLLOUT)
 
 
+@pytest.mark.parametrize("n_train_tasks", [2, 300])
+def test_a_loaded_model_collects_on_tasks_of_its_new_env(
+    tiny_pearl: MakePEARL, tmp_path: Path, n_train_tasks: int
+) -> None:
+    tiny_pearl().learn(ROLLOUT).save(tmp_path / "model.zip")
+    env = make_task_vec_env(ENV_ID, 2, env_kwargs={"n_train_tasks": n_train_tasks})
+    loaded = PEARL.load(tmp_path / "model.zip", env=env)
+    assert set(loaded._next_tasks(n_train_tasks)) == set(range(n_train_tasks))
+    loaded.learn(ROLLOUT)
+
+
 def test_the_policy_can_be_saved_alone(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
     model = tiny_pearl().learn(ROLLOUT)
     model.policy.save(str(tmp_path / "policy"))

@@ -37,7 +37,7 @@ class Belief(ParticleExplorer):
     returned half as much. The others have a single z, the one that promises the largest return: of a particle, under the same
     belief; of the best episode so far, what it returned. The encoder's posterior mean, given a new best episode, is tried
     once. Where an episode begins elsewhere each time, a z that was good may be a bad one: an episode that is not rewarded and
-    whose value, as it goes on, is not what it was at the start, searches on.
+    whose value, as it goes on, is not what it was at the start, searches on to its end.
 
     :param margin: a particle must promise so many times what the best episode returned, to be tried in its place
     """
@@ -58,13 +58,14 @@ class Belief(ParticleExplorer):
         self._n_steps = np.zeros(n_envs, dtype=np.int64)
         # Steps from one choice within an episode to the next
         self._every = np.ones(n_envs, dtype=np.int64)
-        # Value of acting with the only z of the running episode, at its start
+        # Value of acting with the only z of the running episode, at its start; whether it was not kept
         self._promised = np.zeros(n_envs)
+        self._gave_up = np.zeros(n_envs, dtype=bool)
         # Of all episodes, and of those with one z
         self._best_return = np.zeros(n_envs)
         self._best_z = np.zeros_like(self.z)
         self._best_z_return = np.zeros(n_envs)
-        # Particles whose return is known, and the one that is acted with, -1 for none
+        # Particles that had an episode, and the one that is acted with, -1 for none
         self._tried = np.zeros((n_envs, len(self.particles.z)), dtype=bool)
         self._particle = np.full(n_envs, -1)
         # The encoder's word on a new best episode
@@ -87,9 +88,9 @@ class Belief(ParticleExplorer):
         self._searching = np.where(self._at_start, search, self._searching)
         due = self._at_start | (self._n_steps % self._every == 0)
         self._exploit(np.flatnonzero(~self._searching & self._at_start), obs)
-        unrewarded = ~self._at_start & (self.adaptation.episode_return <= 0)
-        self.give_up(np.flatnonzero(~self._searching & due & unrewarded), obs)
-        self._search(np.flatnonzero(self._searching & due), obs)
+        has_one_z = ~self._searching & ~self._gave_up & ~self._at_start
+        self.give_up(np.flatnonzero(has_one_z & due & (self.adaptation.episode_return <= 0)), obs)
+        self._search(np.flatnonzero((self._searching | self._gave_up) & due), obs)
         self._at_start[:] = False
 
     def _search(self, envs: np.ndarray, obs: np.ndarray) -> None:
@@ -139,7 +140,7 @@ class Belief(ParticleExplorer):
             return
         kept = self.adaptation.gamma ** self._n_steps[envs] * self._values(envs, obs)
         promised = self._promised[envs]
-        self._searching[envs] = (promised > MIN_VALUE) & (kept < KEPT * promised)
+        self._gave_up[envs] = (promised > MIN_VALUE) & (kept < KEPT * promised)
 
     def _values(self, envs: np.ndarray, obs: np.ndarray) -> np.ndarray:
         """(k,), of going on with z."""
@@ -167,7 +168,7 @@ class Belief(ParticleExplorer):
         repeatable = envs[~self._turned[envs] & (returns > self._best_z_return[envs] + ROUNDING)]
         self._best_z[repeatable], self._best_z_return[repeatable] = self.z[repeatable], episode_return[repeatable]
         self.propose(better)
-        self._turned[envs], self._at_start[envs] = False, True
+        self._turned[envs], self._gave_up[envs], self._at_start[envs] = False, False, True
         self._n_steps[envs], self._particle[envs] = 0, -1
 
     def propose(self, envs: np.ndarray) -> None:

@@ -84,7 +84,7 @@ def adapt(agent: TrainedAgent, args: argparse.Namespace) -> Adapted:
         found = ~adaptation.exploring()
         if adaptation.knowledge.tells_success:
             found &= adaptation.best_return > 0
-        known_z = particles.z[particles.is_train].numpy()
+        known_z = particles.z[particles.is_train].cpu().numpy()
         mean, deviation = adaptation.posterior()
         latent = Latent(tasks[found], mean[found], deviation[found], known_z)
     start = start_position(agent.make_env()) if record.achieved.shape[-1] == 2 else None

@@ -149,7 +149,7 @@ class Player:
         for step in adaptation_steps(env, adaptation, n_episodes, policy.unscale_action, act, obs):
             n_steps, ended = n_steps + 1, bool(step.dones[0])
             returns[-1] += float(step.rewards[0])
-            successes[-1] |= step.infos[0].get("is_success", False)
+            successes[-1] |= bool(step.infos[0].get("is_success", False))
             yield moment(n_steps, exploring, ended)
             if ended:
                 n_steps, exploring = 0, bool(adaptation.exploring()[0])
