@@ -62,7 +62,8 @@ def _tells_rewards(family: Any) -> bool:
 
 def _check_interface(env: gym.Env[Any, Any]) -> TaskFamily:
     base: Any = env.unwrapped
-    _require(hasattr(base, "task_family"), "The env has no `task_family`: derive it from htr_envs.TaskEnv.")
+    advice = "hide the goal of a GoalEnv with htr_envs.hide_goal, derive any other env from htr_envs.TaskEnv."
+    _require(hasattr(base, "task_family"), f"The env has no `task_family`: {advice}")
     family: TaskFamily = base.task_family
     hooks = REWARD_HOOKS if _tells_rewards(family) else ()
     for name in ("set_task", *hooks[::2], *TASK_SETS, "task_space"):

@@ -296,9 +296,10 @@ def hide_goal(env_id: str, **env_kwargs: Any) -> str:
     spec = GoalEnvSource.find(env_id, env_kwargs).spec
     hidden_id = f"{NAMESPACE}/{spec.id.replace('/', '-')}"
     # the registration, not its id: in a process of its own the registry may not have it
-    kwargs = {"env_id": spec}
-    if hidden_id not in gym.registry or gym.registry[hidden_id].kwargs != kwargs:
-        register(hidden_id, "htr_envs.goal_env:HiddenGoalEnv", max_episode_steps=spec.max_episode_steps, kwargs=kwargs)
+    known = gym.registry.get(hidden_id)
+    if known is None or GoalEnvSource.find(known.kwargs["env_id"], {}) != GoalEnvSource.find(spec, {}):
+        steps = spec.max_episode_steps
+        register(hidden_id, "htr_envs.goal_env:HiddenGoalEnv", max_episode_steps=steps, kwargs={"env_id": spec})
     return hidden_id
 
 
@@ -311,4 +312,5 @@ def find_hidden(env_id: str) -> None:
     namespace, _, goal_env_id = env_id.partition("/")
     # no "module:id": what a file may name is looked up here too, and must not have code imported
     if namespace == NAMESPACE and ":" not in goal_env_id and env_id not in gym.registry:
-        hide_goal(goal_env_id)
+        own = [known for known in gym.registry if known.replace("/", "-") == goal_env_id]
+        hide_goal(own[0] if own else goal_env_id)

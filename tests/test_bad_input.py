@@ -481,8 +481,12 @@ def test_an_explorer_whose_z_has_another_shape(tiny_pearl: MakePEARL, z: np.ndar
 def test_only_the_envs_of_a_model_can_be_adapted_to(tiny_pearl: MakePEARL) -> None:
     model = tiny_pearl()
     for other in ("CartPole-v1", "SparseTargetSpeed-v0"):
-        with pytest.raises(ValueError, match="spaces do not match"):
+        with pytest.raises(ValueError, match=r"spaces do not match.*Wrap the env"):
             model.adapt(gym.make(other))
+    goal_env = gym.make(ENV_ID)
+    goal_env.observation_space = spaces.Dict(observation=spaces.Box(-1, 1, (2,)))
+    with pytest.raises(ValueError, match=r"spaces do not match.*concatenate observation and achieved_goal"):
+        model.adapt(goal_env)
     for agent in (model, RL2("MlpLstmPolicy", ENV_ID), ScriptedAgent.random(spaces.Box(-2, 2, (2,)))):
         other = ENV_ID if isinstance(agent, ScriptedAgent) else "SparseTargetSpeed-v0"
         with pytest.raises(ValueError, match="spaces do not match"):

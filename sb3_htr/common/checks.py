@@ -22,7 +22,10 @@ REWARD_WRAPPERS: dict[str, type[gym.Wrapper]] = {
     "gymnasium's RewardWrapper": gym.RewardWrapper,
     "gymnasium's NormalizeReward": gym.wrappers.NormalizeReward,
 }
-TASK_ENV_ADVICE = "derive the env from htr_envs.TaskEnv and test it with htr_envs.check_task_env"
+TASK_ENV_ADVICE = (
+    "hide the goal of a GoalEnv with htr_envs.hide_goal, on the command line --env HiddenGoal/ID; derive any other env from "
+    "htr_envs.TaskEnv and test it with htr_envs.check_task_env"
+)
 VARIADIC = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
 
 
@@ -78,7 +81,11 @@ def check_fits(env: VecEnv, observation_space: spaces.Space[Any], action_space: 
     ):
         boxes = isinstance(here, spaces.Box) and isinstance(there, spaces.Box)
         if not boxes or here.shape != there.shape or not _bounds_fit(here, there, name == "Observation"):
-            raise ValueError(f"{name} spaces do not match: {here} here, {there} in training.")
+            if isinstance(here, spaces.Dict):
+                advice = "Of a GoalEnv, concatenate observation and achieved_goal, in this order, with a TransformObservation."
+            else:
+                advice = "Wrap the env to have those of training (RescaleAction does it for actions), or train another model."
+            raise ValueError(f"{name} spaces do not match: {here} here, {there} in training. {advice}")
 
 
 def _bounds_fit(here: Any, there: Any, may_be_unknown: bool) -> bool:

@@ -4,6 +4,7 @@ import contextlib
 import copy
 import importlib
 import os
+import signal
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, cast
@@ -216,11 +217,17 @@ def make_task_vec_env(
     try:
         spec, env_kwargs = gym.spec(env_id), env_kwargs or {}
     except (gym.error.NameNotFound, gym.error.NamespaceNotFound) as error:
-        raise type(error)(f"{error} Import the package that registers it before, as in `import htr_envs`.") from None
+        namespace, _, goal_env = env_id.partition("/")
+        before = f"htr_envs.hide_goal({goal_env!r})" if namespace == "HiddenGoal" else "import htr_envs"
+        advice = "Have it registered" if namespace == "HiddenGoal" else "Import the package that registers it"
+        raise type(error)(f"{error} {advice} before, as in `{before}`.") from None
     venv: VecEnv
     if spec.vector_entry_point is None or wrapper is not None or vec_env_class is not None:
 
         def make_env() -> gym.Env:
+            if vec_env_class is SubprocVecEnv:
+                # Ctrl-C is for the training, which ends a rollout, and then these
+                signal.signal(signal.SIGINT, signal.SIG_IGN)
             # Not by its id alone: in a process of its own, the registry may not have it
             env = gym.make(spec, **env_kwargs)
             return env if wrapper is None else wrapper(env)

@@ -65,6 +65,7 @@ class EpisodeStore:
     :param episodes_per_task: capacity of each task's ring, in episodes; then the oldest episode is overwritten
     :param episode_length: largest number of steps of an episode
     :param row_dim: number of columns of a transition
+    :param in_order: whether the transitions of an episode followed each other; if not, targets are of one step
     """
 
     #: How often something was written
@@ -72,7 +73,8 @@ class EpisodeStore:
     #: (n_slots,) int, which of these times is that of the episode in a slot
     written: np.ndarray
 
-    def __init__(self, n_tasks: int, episodes_per_task: int, episode_length: int, row_dim: int) -> None:
+    def __init__(self, n_tasks: int, episodes_per_task: int, episode_length: int, row_dim: int, in_order: bool = True) -> None:
+        self.in_order = in_order
         self.episodes_per_task = episodes_per_task
         self.episode_length = episode_length
         self.n_added = np.zeros(n_tasks, dtype=np.int64)

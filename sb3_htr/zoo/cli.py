@@ -84,6 +84,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
+def _nobody_reads() -> bool:
+    """Whether who reads the output, as `head` does, has seen enough. Then nothing more is written at the end either."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return True
+    return False
+
+
 def console() -> int:
     """
     :return: exit status of :func:`main`; 1 and a sentence, without the way to it, for an error; 130 after Ctrl-C
@@ -93,14 +103,12 @@ def console() -> int:
         th.set_num_threads(1)
     try:
         return main()
-    except BrokenPipeError:
-        # Whoever reads the output, as `head` does, has seen enough; nothing more can be written at the end either
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
     except KeyboardInterrupt:
         print("sb3-htr: stopped", file=sys.stderr)
         return 130
     except Exception as error:
+        if isinstance(error, BrokenPipeError) and _nobody_reads():
+            return 1
         if os.environ.get("SB3_HTR_TRACEBACK"):
             raise
         name = "" if isinstance(error, MISTAKES) else f"{type(error).__name__}: "

@@ -19,7 +19,7 @@ from sb3_htr.htr.relabel import TrainingTaskRelabelling
 
 KINDS: list[dict[str, Any]] = [
     {"name": "HindsightForesight"},
-    {"name": "HindsightInference"},
+    {"name": "HindsightInference", "level": "episode"},
     {"name": "HindsightInference", "level": "transition"},
 ]
 kinds = pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.get("level", kind["name"]))
@@ -186,6 +186,16 @@ def test_what_is_relabelled_step_by_step_makes_up_episodes_of_one_task() -> None
     lengths = np.diff(index.episode_row)
     assert lengths.max() <= 20 and lengths.sum() == buffer.size() == 60 * 20
     assert len(index.tasks) > 40, "without a reward, all tasks are as probable"
+
+
+@pytest.mark.parametrize("kind", KINDS[1:], ids=["episode", "transition"])
+def test_returns_of_several_steps_are_of_steps_that_followed_each_other(kind: dict[str, Any]) -> None:
+    buffer = relabelling(kind, n_episodes=30, buffer_size=80_000)
+    data = buffer.sample(16, meta_batch_size=32, n_steps=3, gamma=0.9)
+    steps = np.rint(np.log(data.discounts.numpy()) / np.log(0.9))
+    way = np.abs(data.next_observations.numpy() - data.observations.numpy()).max(axis=1)
+    assert (way <= 0.1 * steps + 1e-5).all(), "a step leads 0.1 away at most"
+    assert set(steps) == ({1, 2, 3} if kind["level"] == "episode" else {1})
 
 
 def test_a_task_without_hindsight_lends_its_row() -> None:

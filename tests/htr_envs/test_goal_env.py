@@ -306,6 +306,16 @@ def test_ids_that_are_spelt_are_registered() -> None:
     find_hidden("SparsePointRobot-v0")
 
 
+def test_an_id_with_a_namespace_is_found_by_that_of_its_family(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(gym.registry, "my/Toy-v0", gym.envs.registration.EnvSpec("my/Toy-v0", gym.spec(TOY).entry_point))
+    find_hidden("HiddenGoal/my-Toy-v0")
+    assert gym.registry["HiddenGoal/my-Toy-v0"].kwargs["env_id"].id == "my/Toy-v0"
+
+
+def test_arguments_may_be_arrays() -> None:
+    assert hide_goal(CHOICE, place=np.zeros(3)) == hide_goal(CHOICE, place=np.zeros(3))
+
+
 @pytest.mark.parametrize(
     ("env_id", "sentence"),
     [

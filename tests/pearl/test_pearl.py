@@ -302,9 +302,7 @@ def test_loading_for_prediction_stores_nothing_and_an_env_can_come_later(tiny_pe
 
 
 @pytest.mark.parametrize("n_train_tasks", [2, 300])
-def test_a_loaded_model_collects_on_tasks_of_its_new_env(
-    tiny_pearl: MakePEARL, tmp_path: Path, n_train_tasks: int
-) -> None:
+def test_a_loaded_model_collects_on_tasks_of_its_new_env(tiny_pearl: MakePEARL, tmp_path: Path, n_train_tasks: int) -> None:
     tiny_pearl().learn(ROLLOUT).save(tmp_path / "model.zip")
     env = make_task_vec_env(ENV_ID, 2, env_kwargs={"n_train_tasks": n_train_tasks})
     loaded = PEARL.load(tmp_path / "model.zip", env=env)

@@ -238,6 +238,7 @@ def test_the_console_answers_mistakes_in_one_sentence(
 ) -> None:
     for arguments, message in (
         (["enjoy", "--env", "Nothing-v0"], "There is no trained agent for Nothing-v0"),
+        (["evaluate", "--env", "SparsePointRobt-v0"], "no such env: did you mean SparsePointRobot-v0"),
         (["train", "--env", ENV_ID, "--env-kwargs", "goal_dist:1"], "TypeError: .* unexpected keyword argument 'goal_dist'"),
         (["train", "--env", "SparsePointRobt-v0"], "did you mean SparsePointRobot-v0"),
         (["evaluate", str(SHIPPED), "--env-kwargs", "goal_distance:-1"], "goal_distance is -1, expected a number above 0"),
@@ -248,6 +249,13 @@ def test_the_console_answers_mistakes_in_one_sentence(
     monkeypatch.setenv("SB3_HTR_TRACEBACK", "1")
     with pytest.raises(ValueError):
         cli.console()
+    monkeypatch.delenv("SB3_HTR_TRACEBACK")
+
+    def broken(argv: object = None) -> int:
+        raise BrokenPipeError("of another process, and not of who reads the output")
+
+    monkeypatch.setattr(cli, "main", broken)
+    assert cli.console() == 1 and "BrokenPipeError: of another process" in capsys.readouterr().err
 
     def interrupt(argv: object = None) -> int:
         raise KeyboardInterrupt

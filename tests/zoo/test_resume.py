@@ -256,19 +256,47 @@ def test_kills_at_random_moments_change_nothing(unbroken: Path, tmp_path: Path) 
     assert len(list((run / "checkpoints").iterdir())) == 2
 
 
-def test_an_interrupt_stops_with_a_checkpoint_and_says_how_to_go_on(unbroken: Path, tmp_path: Path) -> None:
-    command = [sys.executable, "-u", "-m", "sb3_htr.zoo.cli", *TRAIN, "-f", str(tmp_path)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+@pytest.mark.parametrize("vec_env", ["dummy", "subproc"])
+def test_an_interrupt_stops_with_a_checkpoint_and_says_how_to_go_on(unbroken: Path, tmp_path: Path, vec_env: str) -> None:
+    """As a terminal sends it, to all processes of the command."""
+    command = [sys.executable, "-u", "-m", "sb3_htr.zoo.cli", *TRAIN, "-f", str(tmp_path), "--vec-env", vec_env]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True)
     run = run_folder(tmp_path)
     while process.poll() is None and not checkpoints(run):
         time.sleep(0.005)
-    process.send_signal(signal.SIGINT)
+    os.killpg(process.pid, signal.SIGINT)
     output = process.communicate(timeout=60)[0]
     assert process.returncode == 0, output
     assert f"sb3-htr train --resume {run}" in output
     assert "Press Ctrl-C again" in output
     assert main(["train", "--resume", str(run)]) == 0
     assert_same_run(run, unbroken)
+
+
+FRAGILE = """
+import os
+import gymnasium
+import htr_envs
+
+class Fragile(type(gymnasium.make("SparsePointRobot-v0").unwrapped)):
+    n_steps = 0
+
+    def step(self, action):
+        self.n_steps += 1
+        if self.n_steps == 50:
+            os._exit(1)
+        return super().step(action)
+
+gymnasium.register("Fragile-v0", Fragile, max_episode_steps=20)
+"""
+
+
+def test_a_dead_env_process_is_named_by_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "fragile.py").write_text(FRAGILE)
+    monkeypatch.chdir(tmp_path)
+    arguments = ["train", "--env", "Fragile-v0", "--gym-packages", "fragile", "--vec-env", "subproc", "-n", "1000"]
+    with pytest.raises(RuntimeError, match="process of an env died"):
+        main([*arguments, "-f", "logs", "-params", "n_envs:2", "gradient_steps:1"])
 
 
 def test_a_full_disk_stops_no_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,6 +21,8 @@ class HindsightBuffers(Relabeller):
     #: With the hindsight buffers in place of tasks
     episodes: EpisodeStore
     keeps_experience = True
+    #: Whether the transitions of an episode in there followed each other
+    in_order = True
 
     def bind(self, buffer: "MultiTaskReplayBuffer") -> None:
         super().bind(buffer)
@@ -31,7 +33,8 @@ class HindsightBuffers(Relabeller):
         :param n: number of hindsight buffers to begin with, empty ones
         """
         own = self.buffer.episodes
-        self.episodes = EpisodeStore(n, own.episodes_per_task, own.episode_length, self.buffer.transitions.width)
+        width = self.buffer.transitions.width
+        self.episodes = EpisodeStore(n, own.episodes_per_task, own.episode_length, width, self.in_order)
 
     def draw_from(self, chosen: np.ndarray, tasks: np.ndarray) -> HindsightDraw:
         """

@@ -22,7 +22,8 @@ class HindsightInference(TrainingTaskRelabelling):
     :param level: what gets a task. ``"episode"`` (default): an episode, by its return under the task, the posterior of
         maximum-entropy inverse RL over trajectories. ``"transition"``: each step on its own, by the critics' Q(s, a, z), where
         z is the posterior mean of the task given its latest experience; HIPI's code relabels transitions, and HFR's code has
-        HIPI in this form. Contexts of PEARL are episodes, which is why the other is the default
+        HIPI in this form; targets of these are of one step, whatever ``n_steps``. Contexts of PEARL are episodes, which is why
+        the other is the default
     :param context_size: for ``"transition"``: steps that z is inferred from, at most
     :raises ValueError: for an unknown level, or a number that is out of its range
     """
@@ -33,6 +34,7 @@ class HindsightInference(TrainingTaskRelabelling):
             raise ValueError(f'level is {level!r}, expected "episode" or "transition".')
         check_numbers(context_size=(context_size, 1, float("inf")))
         self.level = level
+        self.in_order = level == "episode"
         self.context_size = context_size
 
     def utilities(self, rows: np.ndarray, lengths: np.ndarray) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Trained agents: where they are, and the env that each was trained on."""
 
 import contextlib
+import difflib
 import json
 import os
 import zipfile
@@ -282,6 +283,8 @@ def agent_for(
         raise FileNotFoundError(f"There is no trained agent for {wanted} in {folder}/, only runs {', '.join(numbers)}.")
     given = f" --method {method}" if method else ""
     with_agent = sorted(f"{file.stem} ({file.parent.name})" for file in shipped("trained_agents").glob("*/*.zip"))
+    if env_id not in gym.registry and (nearest := difflib.get_close_matches(env_id, gym.registry, n=1)):
+        raise FileNotFoundError(f"There is no trained agent for {wanted}, and no such env: did you mean {nearest[0]}?")
     raise FileNotFoundError(
         f"There is no trained agent for {wanted} in {folder}/: train one with "
         f"`sb3-htr train --env {env_id}{given} -f {folder}`. The package comes with {', '.join(with_agent) or 'none'}."

@@ -1,5 +1,6 @@
 """rl_zoo3's experiment manager, for runs of task envs."""
 
+import contextlib
 import importlib
 import json
 import shlex
@@ -10,7 +11,6 @@ import threading
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stdout
 from datetime import datetime, timezone
 from functools import partial
 from io import StringIO
@@ -85,7 +85,7 @@ class MetaExperimentManager(ExperimentManager):
             check_numbers(n_timesteps=(self.n_timesteps, 1, float("inf")))
         given, trial_id = dict(self.custom_hyperparams or {}), self.trial_id
         self.custom_hyperparams, self.trial_id = None, None
-        with redirect_stdout(StringIO()):  # it prints what is not all of it
+        with contextlib.redirect_stdout(StringIO()):  # it prints what is not all of it
             try:
                 hyperparams, _ = super().read_hyperparameters()
             except (AttributeError, TypeError):
@@ -251,7 +251,8 @@ class MetaExperimentManager(ExperimentManager):
                 if checkpoints(Path(self.save_path)) and (stopping or model.num_timesteps < self.n_timesteps):
                     print(f"To go on: {self._to_go_on()}")
                 assert model.env is not None
-                model.env.close()
+                with contextlib.suppress(EOFError, ConnectionError):  # of envs in processes that have died
+                    model.env.close()
                 self._lock.release()
 
     def _to_go_on(self) -> str:
@@ -364,7 +365,7 @@ class MetaExperimentManager(ExperimentManager):
             path.write_text(json.dumps(record, indent=2, default=str))
 
 
-@contextmanager
+@contextlib.contextmanager
 def _soft_interrupt(checkpointing: CheckpointCallback | None) -> Iterator[None]:
     """Let the first Ctrl-C end the training before the next rollout, with a checkpoint, and the second one at once."""
     if checkpointing is None or threading.current_thread() is not threading.main_thread():
