@@ -1,9 +1,14 @@
 """Batched envs as SB3 wants them."""
 
+import os
+import signal
+import time
 from pathlib import Path
 
 import gymnasium as gym
+import numpy as np
 import pytest
+from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from helpers import ENV_ID
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
@@ -37,3 +42,16 @@ def test_a_batch_has_the_attributes_of_single_envs() -> None:
     assert env.has_attr("task") and len(env.get_attr("task")) == 2
     with pytest.raises(ValueError, match="One call serves the whole batch of envs, not some of them: leave indices away"):
         env.env_method("set_task", None, indices=[0])
+
+
+def test_ctrl_c_leaves_envs_in_processes_to_the_training() -> None:
+    """A terminal sends it to all processes."""
+    env = make_task_vec_env(ENV_ID, 1, vec_env_class=SubprocVecEnv)
+    env.reset()
+    processes = env.unwrapped.processes  # type: ignore[attr-defined]
+    for process in processes:
+        os.kill(process.pid, signal.SIGINT)
+    time.sleep(0.5)
+    env.step(np.zeros((1, 2), dtype=np.float32))
+    env.close()
+    assert all(process.exitcode == 0 for process in processes)
