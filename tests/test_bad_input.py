@@ -311,6 +311,7 @@ def test_a_window_without_a_screen_is_refused_with_what_to_do(monkeypatch: pytes
             ["--env", ENV_ID, "-params", "policy_kwargs:{'latent_dimm': 3}"],
             "policy_kwargs has no setting 'latent_dimm': did you",
         ),
+        (["--env", ENV_ID, "-conf", "pearl_pior.yml"], r"There is no file pearl_pior.yml: did you mean pearl_prior.yml\?"),
         (["--env", ENV_ID, "-params", "gamma:abc"], "'abc' is not defined: the values of -params .* strings in quotes"),
         (["--env", ENV_ID, "-params", "gamma=0.9"], "the values of -params and --env-kwargs are Python"),
         (["--env", ENV_ID, "-params", "n_envs:0"], "n_envs is 0, expected a whole number of at least 1"),
@@ -342,6 +343,7 @@ def test_what_cannot_be_trained_is_refused_in_one_sentence(
         ("mine:Speed-v0", r"--env is 'mine:Speed-v0', with a module: give --gym-packages mine --env Speed-v0"),
         ("SparsePointRobo-v0", r"There is no env SparsePointRobo-v0: did you mean SparsePointRobot-v0\? An env of your own"),
         ("Xyz-v0", r"There is no env Xyz-v0: An env of your own is found once its module is imported, by --gym-packages"),
+        ("HiddenGoal/Xyz-v0", r"Xyz.* doesn't exist.* An env of your own is found once its module is imported, by --gym"),
     ],
 )
 def test_an_unknown_id_on_the_command_line_says_how_one_is_found(env_id: str, message: str) -> None:

@@ -18,6 +18,7 @@ from sb3_htr.zoo.run.memory import keep_freed_memory
 from sb3_htr.zoo.run.method import DEFAULT, get_method, methods
 from sb3_htr.zoo.run.trust import CONF, check_arguments, import_packages, see_working_folder
 
+OWN_ENV = "An env of your own is found once its module is imported, by --gym-packages MODULE."
 HELP = """sb3-htr train: rl_zoo3's train (its arguments follow) with evaluations that adapt to validation tasks.
 
 examples:
@@ -99,7 +100,10 @@ def main(argv: Sequence[str]) -> None:
             if before in CONF and Path(word).exists():
                 rest[i] = str(Path(word).resolve())  # wherever the run goes on from
         given = [*env, *rest, *packages]
-        find_hidden(args.env or "")
+        try:
+            find_hidden(args.env or "")
+        except gym.error.UnregisteredEnv as error:
+            raise ValueError(f"{error} {OWN_ENV}") from None
         if env:
             _check_id(args.env)
     keep_freed_memory()
@@ -122,6 +126,4 @@ def _check_id(env_id: str) -> None:
         raise ValueError(f"--env is {env_id!r}, with a module: give --gym-packages {module} --env {name}.")
     nearest = difflib.get_close_matches(env_id, gym.registry, n=1)
     meant = f"did you mean {nearest[0]}? " if nearest else ""
-    raise ValueError(
-        f"There is no env {env_id}: {meant}An env of your own is found once its module is imported, by --gym-packages MODULE."
-    )
+    raise ValueError(f"There is no env {env_id}: {meant}{OWN_ENV}")
