@@ -311,7 +311,6 @@ def test_a_window_without_a_screen_is_refused_with_what_to_do(monkeypatch: pytes
             ["--env", ENV_ID, "-params", "policy_kwargs:{'latent_dimm': 3}"],
             "policy_kwargs has no setting 'latent_dimm': did you",
         ),
-        (["--env", ENV_ID, "-conf", "pearl_pior.yml"], r"There is no file pearl_pior.yml: did you mean pearl_prior.yml\?"),
         (["--env", ENV_ID, "-params", "gamma:abc"], "'abc' is not defined: the values of -params .* strings in quotes"),
         (["--env", ENV_ID, "-params", "gamma=0.9"], "the values of -params and --env-kwargs are Python"),
         (["--env", ENV_ID, "-params", "n_envs:0"], "n_envs is 0, expected a whole number of at least 1"),
@@ -349,6 +348,11 @@ def test_what_cannot_be_trained_is_refused_in_one_sentence(
 def test_an_unknown_id_on_the_command_line_says_how_one_is_found(env_id: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         main(["train", "--env", env_id])
+
+
+def test_a_settings_file_that_is_not_there() -> None:
+    with pytest.raises(FileNotFoundError, match=r"There is no file pearl_pior\.yml: did you mean pearl_prior\.yml\?"):
+        main(["train", "--env", ENV_ID, "-conf", "pearl_pior.yml"])
 
 
 def test_a_file_is_no_module() -> None:
