@@ -255,7 +255,7 @@ def test_the_console_answers_mistakes_in_one_sentence(
         raise BrokenPipeError("of another process, and not of who reads the output")
 
     monkeypatch.setattr(cli, "main", broken)
-    assert cli.console() == 1 and "BrokenPipeError: of another process" in capsys.readouterr().err
+    assert cli.console() == 1 and "sb3-htr: of another process" in capsys.readouterr().err
 
     def interrupt(argv: object = None) -> int:
         raise KeyboardInterrupt
