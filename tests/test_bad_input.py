@@ -342,7 +342,6 @@ def test_what_cannot_be_trained_is_refused_in_one_sentence(
         ("mine:Speed-v0", r"--env is 'mine:Speed-v0', with a module: give --gym-packages mine --env Speed-v0"),
         ("SparsePointRobo-v0", r"There is no env SparsePointRobo-v0: did you mean SparsePointRobot-v0\? An env of your own"),
         ("Xyz-v0", r"There is no env Xyz-v0: An env of your own is found once its module is imported, by --gym-packages"),
-        ("HiddenGoal/Xyz-v0", r"Xyz.* doesn't exist.* An env of your own is found once its module is imported, by --gym"),
     ],
 )
 def test_an_unknown_id_on_the_command_line_says_how_one_is_found(env_id: str, message: str) -> None:

@@ -77,5 +77,5 @@ def test_the_goal_env_of_a_user_is_trained_on_by_its_id(
 
 
 def test_a_goal_env_that_is_not_there_is_named() -> None:
-    with pytest.raises(gym.error.Error, match="NoSuchEnv"):
+    with pytest.raises(gym.error.Error, match=r"NoSuchEnv.* by --gym-packages MODULE"):
         main(["train", "--env", "HiddenGoal/NoSuchEnv-v0"])

@@ -103,7 +103,7 @@ def main(argv: Sequence[str]) -> None:
         try:
             find_hidden(args.env or "")
         except gym.error.UnregisteredEnv as error:
-            raise ValueError(f"{error} {OWN_ENV}") from None
+            raise type(error)(f"{error} {OWN_ENV}") from None
         if env:
             _check_id(args.env)
     keep_freed_memory()
