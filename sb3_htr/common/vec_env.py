@@ -218,9 +218,11 @@ def make_task_vec_env(
         spec, env_kwargs = gym.spec(env_id), env_kwargs or {}
     except (gym.error.NameNotFound, gym.error.NamespaceNotFound) as error:
         namespace, _, goal_env = env_id.partition("/")
-        before = f"htr_envs.hide_goal({goal_env!r})" if namespace == "HiddenGoal" else "import htr_envs"
-        advice = "Have it registered" if namespace == "HiddenGoal" else "Import the package that registers it"
-        raise type(error)(f"{error} {advice} before, as in `{before}`.") from None
+        if namespace == "HiddenGoal":
+            advice = f"Have it registered before, by `htr_envs.hide_goal({goal_env!r})`."
+        else:
+            advice = "Import the package that registers it before, as in `import htr_envs`."
+        raise type(error)(f"{error} {advice}") from None
     venv: VecEnv
     if spec.vector_entry_point is None or wrapper is not None or vec_env_class is not None:
 

@@ -152,7 +152,7 @@ def check(results: dict[Cell, Path]) -> None:
 
 def write(command: str, experiment: Experiment, results: dict[Cell, Path], folder: Path) -> None:
     """
-    Write ``summary.json``, ``raw.npz`` and the pictures of an experiment.
+    Write ``summary.json``, a ``raw-METHOD.npz`` for each method and the pictures of an experiment.
 
     :param command: that repeats it
     :param experiment: draws the picture
@@ -162,11 +162,13 @@ def write(command: str, experiment: Experiment, results: dict[Cell, Path], folde
     """
     check(results)
     folder.mkdir(parents=True, exist_ok=True)
-    raw: dict[str, Any] = {
-        f"{cell.name}/{key}": value for cell, path in results.items() for key, value in load_arrays(path).items()
-    }
-    with atomic_path(folder / "raw.npz") as path:
-        np.savez_compressed(path, **raw)
+    # Of all methods together it may be some megabytes
+    raw: dict[str, dict[str, Any]] = {}
+    for cell, result in results.items():
+        raw.setdefault(cell.method, {}).update({f"{cell.name}/{key}": value for key, value in load_arrays(result).items()})
+    for method, arrays in raw.items():
+        with atomic_path(folder / f"raw-{method}.npz") as path:
+            np.savez_compressed(path, **arrays)
     with atomic_path(folder / "summary.json") as path:
         path.write_text(json.dumps(summarize(command, results), indent=1) + "\n")
     experiment.figure(results, folder / f"{experiment.name}.png")

@@ -133,8 +133,6 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         self.task_bank: TaskBank | None = None
         #: Called after each update
         self.update_listeners: list[Callable[[], None]] = []
-        # Training tasks in the order of the coming rollouts: every task once, then every task once in another order
-        self._task_queue = np.zeros(0, dtype=np.int64)
         self._n_rollouts = 0
         self._warned_not_adapted = False
 
@@ -190,7 +188,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         checks.check_rewards(env)
         family = checks.get_task_family(env)
         self.max_episode_steps = checks.get_max_episode_steps(env)
-        # What another family left
+        # Training tasks in the order of the coming rollouts: every task once, then every task once in another order
         self._task_queue = np.zeros(0, dtype=np.int64)
         buffer_class = cast(type[MultiTaskReplayBuffer], self.replay_buffer_class)
         self.replay_buffer = buffer_class(

@@ -53,9 +53,10 @@ def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monk
     monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 50)
     report.write(f"sb3-htr experiment {name}", experiment, made_up(cells, tmp_path), folder)
     assert all((folder / picture).stat().st_size > 10_000 for picture in (f"{name}.png", "reliability.png"))
-    raw = np.load(folder / "raw.npz")
-    assert {key.split("/")[0] for key in raw.files} == {cell.name for cell in cells}
-    assert all((raw[f"{cell.name}/returns_{cell.evaluations[0].name}"] == cell.seed).all() for cell in cells)
+    for method in {cell.method for cell in cells}:
+        raw, own = np.load(folder / f"raw-{method}.npz"), [cell for cell in cells if cell.method == method]
+        assert {key.split("/")[0] for key in raw.files} == {cell.name for cell in own}
+        assert all((raw[f"{cell.name}/returns_{cell.evaluations[0].name}"] == cell.seed).all() for cell in own)
     summary = json.loads((folder / "summary.json").read_text())
     value = {"last_episode_return": 2.0, "success_rate": 1.0, "episodes_to_first_success": 3.0, "loss_of_stability": 1.0}
     value |= {"env_steps_to_solved": 3000.0, "seconds_to_solved": 3.0}

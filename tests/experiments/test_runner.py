@@ -97,7 +97,8 @@ def test_the_command_repeats_an_experiment(
     assert "SparsePointRobot-v0: Two tiny runs." in capsys.readouterr().out
     assert main(["experiment", "tiny", "--quick", "--jobs", "1"]) == 0
     results, runs = tmp_path / "results" / "quick-tiny", tmp_path / "runs" / "quick"
-    assert {path.name for path in results.iterdir()} == {"tiny.png", "reliability.png", "raw.npz", "summary.json"}
+    raw = {"raw-htr-ec.npz", "raw-pearl-sparse-prior.npz"}
+    assert {path.name for path in results.iterdir()} == {"tiny.png", "reliability.png", "summary.json", *raw}
     summary = json.loads((results / "summary.json").read_text())
     assert summary["command"] == "sb3-htr experiment tiny --quick", "what repeats these results"
     coarse, plain = (agent_at(cell.run_folder(runs), trust=True) for cell in experiment.cells(1, 0.1))
