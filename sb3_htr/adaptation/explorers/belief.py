@@ -19,10 +19,8 @@ N_COMPARED = 32
 N_CHOICES = 40
 # A value below says nothing about how far a task is
 MIN_VALUE = 1e-3
-# Of what was found, what an episode with one z must return to end the search
-REPEATED = 0.5
-# Of what the critics promised at its start, what they must still promise in an unrewarded episode, or it searches on. By
-# measurement, docs/trials.md
+# When an episode with one z keeps its word: of what was found, what it must return to end the search; of what the critics
+# promised at its start, what they must still promise as long as it is unrewarded. By measurement, docs/trials.md
 KEPT = 0.5
 
 
@@ -83,7 +81,7 @@ class Belief(ParticleExplorer):
         return np.where((self._best_z_return > 0)[:, None], self._best_z, self.z)
 
     def look(self, obs: np.ndarray) -> None:
-        unsure = (self._best_z_return <= REPEATED * self._best_return) & ~self._has_proposal
+        unsure = (self._best_z_return <= KEPT * self._best_return) & ~self._has_proposal
         search = unsure & (self.exploring() | ~self._searching)
         self._searching = np.where(self._at_start, search, self._searching)
         due = self._at_start | (self._n_steps % self._every == 0)
