@@ -263,6 +263,19 @@ ALL = (
         eval_freq=250_000,
         evaluations=by(BELIEF),
     ),
+    # Settings of the maze, and the entropy coefficient of the other ant; no others were tried. Five episodes, as an evaluation
+    # of twenty takes hours
+    Experiment(
+        "ant_maze",
+        "An ant in a maze, its goal hidden.",
+        "HiddenAntMazeUMaze-v0",
+        2_000_000,
+        (Variant("htr-ser", settings={"train_explorer": "belief", "gamma": 0.99, "ent_coef": 0.05}),),
+        seeds=3,
+        eval_freq=250_000,
+        evaluations=by(BELIEF),
+        n_episodes=5,
+    ),
     # RL2 learns slowly; SAC and HER are told the task, and learn fast. Further away there is no training task to relabel under
     Experiment(
         "rivals",
