@@ -1,8 +1,11 @@
 # Everything runs inside .venv, which the first target that needs it builds.
 PYTHON ?= python3
 BIN := .venv/bin
+# Of a user, and of a developer, who needs everything
+BASICS := zoo,video,mujoco
+EXTRAS := $(BASICS),robotics,panda,metaworld,tensorboard,postgresql,docs,dev
+INSTALL := $(BIN)/pip install --quiet -c constraints.txt -e
 STAMP := .venv/.installed
-EXTRAS := zoo,plots,video,mujoco,robotics,panda,metaworld,tensorboard,postgresql,docs,dev
 BENCHMARKS := $(filter-out benchmarks/_%,$(wildcard benchmarks/*.py))
 
 .DEFAULT_GOAL := help
@@ -13,12 +16,16 @@ help: ## show this list
 
 venv: $(STAMP) ## make .venv with the tested versions of everything
 
-$(STAMP): setup.cfg constraints.txt
+.venv/.basics: setup.cfg constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet -c constraints.txt -e ".[$(EXTRAS)]"
+	$(INSTALL) ".[$(BASICS)]"
 	@touch $@
 
-demo: $(STAMP) ## meta-train on SparsePointRobot-v0, then adapt to unseen tasks
+$(STAMP): .venv/.basics
+	$(INSTALL) ".[$(EXTRAS)]"
+	@touch $@
+
+demo: .venv/.basics ## meta-train on SparsePointRobot-v0, then adapt to unseen tasks
 	$(BIN)/sb3-htr train --env SparsePointRobot-v0 -n 24000 -P --verbose 0 --eval-freq 4000 -f runs/demo
 	$(BIN)/sb3-htr evaluate runs/demo
 	$(BIN)/sb3-htr plot runs/demo --only learning -o runs/demo

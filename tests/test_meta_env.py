@@ -65,7 +65,10 @@ def test_the_posterior_is_that_of_the_rewards(tiny_pearl: MakePEARL) -> None:
     model = tiny_pearl(make_cart(), **PLAIN).learn(100)
     adaptation = model.start_adaptation(1, is_training=True)
     before = adaptation.posterior()[0]
-    list(adaptation_steps(model.get_env(), adaptation, 1, model.policy.unscale_action, adaptation.act))  # type: ignore[arg-type]
+    env = model.get_env()
+    assert env is not None
+    obs = np.asarray(env.reset())
+    list(adaptation_steps(env, adaptation, 1, model.policy.unscale_action, adaptation.act, obs))
     assert (adaptation.posterior()[0] != before).any() and not adaptation.explorer.exploring().any()
 
 

@@ -10,10 +10,20 @@ from sb3_htr.experiments.protocol import MIN_RUNS
 
 RESULTS = Path(__file__).parents[1] / "results"
 DOCUMENTS = (RESULTS.parent / "README.md", RESULTS.parent / "docs" / "results.md", RESULTS.parent / "docs" / "performance.md")
-# Experiments, methods and explorers in the table of README.md
-ENVS = ("point_robot", "prior", "wheeled", "ant", "fetch_reach", "fetch_push")
-METHODS = ("htr-ser", "htr-ser-prior", "pearl-dense", "pearl-dense-prior", "pearl-sparse", "pearl-sparse-prior")
-EXPLORERS = ("belief", "prior")
+# Methods in the table of README.md, by their experiments; explorers with what is shown of them
+HEADLINE = {
+    "point_robot": ("htr-ser", "pearl-dense", "pearl-sparse"),
+    "prior": ("htr-ser-prior", "pearl-dense-prior"),
+    "wheeled": ("htr-ser",),
+    "ant": ("htr-ser",),
+    "fetch_reach": ("htr-ser", "pearl-sparse"),
+    "fetch_push": ("htr-ser", "pearl-sparse"),
+    "point_maze": ("htr-ser",),
+}
+EXPLORERS = {
+    "belief": {"last_episode_return": "return", "success_rate": "tasks solved", "episodes_to_first_success": "first success"},
+    "prior": {"last_episode_return": "return", "success_rate": "tasks solved"},
+}
 COLUMNS = {
     "last_episode_return": "return of episode {n_episodes}",
     "success_rate": "tasks solved in it",
@@ -98,19 +108,20 @@ def _place(row: dict[str, Any]) -> str:
 
 def headline(summaries: dict[str, dict[str, Any]]) -> str:
     """
-    :param summaries: contents of ``summary.json`` by their names, those of ``ENVS`` among them where they are there
-    :return: Markdown table, one line per env, method and explorer
+    :param summaries: contents of ``summary.json`` by their names, those of ``HEADLINE`` among them where they are there
+    :return: Markdown table, one line per env and method
     """
-    shown = {metric: head.format(n_episodes=20) for metric, head in COLUMNS.items()}
-    lines = [["env", "env steps", "seeds", "method", "explorer", *shown.values()]]
+    shown = [(explorer, metric) for explorer, metrics in EXPLORERS.items() for metric in metrics]
+    heads = [f"`{explorer}`: {EXPLORERS[explorer][metric]}" for explorer, metric in shown]
+    lines = [["env", "env steps", "runs", "method", *heads]]
     lines.append(["---"] * len(lines[0]))
-    for summary in (summaries[name] for name in ENVS if name in summaries):
-        scores: dict[tuple[str, ...], dict[str, str]] = {}
-        for row in summary["rows"]:
-            if row["variant"] in METHODS and row["explorer"] in EXPLORERS and not row.get("tested_on"):
-                key = (row["env"], f"{row['env_steps']:,}", str(row["n_seeds"]), row["variant"], f"`{row['explorer']}`")
-                scores.setdefault(key, {})[row["metric"]] = _interval(row)
-        lines += [[*key, *(cells[metric] for metric in shown)] for key, cells in scores.items()]
+    for name, methods in HEADLINE.items():
+        scores: dict[tuple[str, ...], dict[tuple[str, str], str]] = {}
+        for row in summaries.get(name, {"rows": []})["rows"]:
+            if row["variant"] in methods and not row.get("tested_on"):
+                key = (row["env"], f"{row['env_steps']:,}", str(row["n_seeds"]), row["variant"])
+                scores.setdefault(key, {})[row["explorer"], row["metric"]] = _interval(row)
+        lines += [[*key, *(cells.get(column, "") for column in shown)] for key, cells in scores.items()]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 

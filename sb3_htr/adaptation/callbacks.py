@@ -9,12 +9,12 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import EvalCallback
 
-from sb3_htr.adaptation.evaluation import N_ENVS, MetaLearner, record_adaptation, task_set
+from sb3_htr.adaptation.evaluation import MetaLearner, record_adaptation, task_set
 from sb3_htr.adaptation.explorers import to_explorer
 from sb3_htr.adaptation.first_success import first_success
 from sb3_htr.common.atomic import WRITE_ERRORS, atomic_path, reason
 from sb3_htr.common.checks import check_numbers, get_task_family
-from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
 
 
 class MetaEvalCallback(EvalCallback):
@@ -46,9 +46,7 @@ class MetaEvalCallback(EvalCallback):
         if isinstance(eval_env, str):
             eval_env = make_task_vec_env(eval_env, N_ENVS)
         super().__init__(eval_env, n_eval_episodes=n_eval_episodes, **kwargs)
-        if isinstance(tasks, str):
-            tasks = task_set(get_task_family(self.eval_env), tasks)
-        self.tasks: np.ndarray = np.asarray(tasks)
+        self.tasks = task_set(get_task_family(self.eval_env), tasks)
         self.explorer = None if explorer is None else to_explorer(explorer)
         self.returns: list[np.ndarray] = []
         self.successes: list[np.ndarray] = []

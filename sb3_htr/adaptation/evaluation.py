@@ -14,18 +14,15 @@ from sb3_htr.adaptation.loop import Adapts, Watched, adaptation_steps
 from sb3_htr.common.checks import (
     check_is_env,
     check_numbers,
-    check_tasks,
     get_max_episode_steps,
     get_task_family,
 )
 from sb3_htr.common.random_state import seeded_actions
 from sb3_htr.common.type_aliases import TaskFamily
-from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env, reset_to_tasks
 
 #: Sets of tasks that a family has
 TASK_SETS = ("test", "validation", "train")
-# Of an env that is given by its id
-N_ENVS = 20
 
 
 class Named(Protocol):
@@ -79,21 +76,21 @@ def run_adaptation(
     policy: BasePolicy,
     env: VecEnv,
     adaptation: Adapts,
+    obs: np.ndarray,
     n_episodes: int,
     deterministic: bool = True,
     seed: int = 0,
-    obs: Any = None,
 ) -> AdaptationRecord:
     """
-    Run ``n_episodes`` episodes of each env, from a reset on.
+    Run ``n_episodes`` episodes of each env.
 
     :param policy: knows the action space
-    :param env: its tasks, or the options to set them at the next reset, are given already
+    :param env: after a reset
     :param adaptation: acts, and learns from the episodes
+    :param obs: (n_envs, obs_dim) of that reset
     :param n_episodes: episodes per env
     :param deterministic: mean actions instead of samples
     :param seed: seed of sampled actions; the random state of training is left alone
-    :param obs: (n_envs, obs_dim) of a reset that was done; by default, one is done here
     :return: one row per env
     :raises ValueError: if there are no episodes
     """
@@ -187,11 +184,9 @@ def record_adaptation(
     for first in range(0, len(tasks), env.num_envs):
         # Envs without a task of their own repeat the last one
         index = np.minimum(np.arange(first, first + env.num_envs), len(tasks) - 1)
-        env.set_options([{"task": task} for task in tasks[index]])
-        obs = env.reset()
-        check_tasks(env, tasks[index])
+        obs = reset_to_tasks(env, tasks[index])
         adaptation = model.start_adaptation(env.num_envs, explorer, generator)
-        record = run_adaptation(model.policy, env, adaptation, n_episodes, deterministic, seed + first, obs)
+        record = run_adaptation(model.policy, env, adaptation, obs, n_episodes, deterministic, seed + first)
         records.append([values[: len(tasks) - first] for values in record])
     length = max(achieved.shape[2] for _, _, achieved in records)
     for record_ in records:

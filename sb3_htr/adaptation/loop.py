@@ -1,7 +1,7 @@
 """The step loop that rollouts, evaluations and whoever watches an agent share."""
 
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
@@ -48,21 +48,19 @@ def adaptation_steps(
     n_episodes: int,
     unscale_action: Callable[[np.ndarray], np.ndarray],
     act: Callable[[np.ndarray], np.ndarray],
-    obs: Any = None,
+    obs: np.ndarray,
 ) -> Iterator[Step]:
     """
     Act until each env has finished so many episodes; envs whose episodes are shorter go on with more of them.
 
-    :param env: its tasks, or the options to set them at the next reset, are given already
+    :param env: after a reset
     :param adaptation: takes in each step, before it is yielded
     :param n_episodes: per env
     :param unscale_action: from [-1, 1] to the bounds of the action space
     :param act: observations (n_envs, obs_dim) to actions (n_envs, action_dim) scaled to [-1, 1]
-    :param obs: (n_envs, obs_dim) of a reset that was done; by default, one is done here
+    :param obs: (n_envs, obs_dim) of that reset
     :return: what each env did, step by step
     """
-    if obs is None:
-        obs = env.reset()
     if isinstance(adaptation, SeesTasks):
         adaptation.see_tasks(np.stack(env.get_attr("task")))
     remaining = np.full(env.num_envs, n_episodes)

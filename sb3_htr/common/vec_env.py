@@ -18,8 +18,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from sb3_htr.common.atomic import reason
-from sb3_htr.common.checks import check_has_task_family, check_numbers, missing_hook
+from sb3_htr.common.checks import check_has_task_family, check_numbers, check_tasks, missing_hook
 
+# Side by side, where nobody says how many
+N_ENVS = 20
 # Attributes of a single task env, and where a batched one keeps those of all envs
 PER_ENV = {"task": "tasks", "task_id": "task_ids"}
 
@@ -102,6 +104,20 @@ class BatchedTaskVecEnv(VecEnv):
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         return [None] * self.num_envs
+
+
+def reset_to_tasks(env: VecEnv, tasks: np.ndarray) -> np.ndarray:
+    """
+    :param env: env of a task family
+    :param tasks: (n_envs, task_dim)
+    :return: (n_envs, obs_dim), first observations of episodes of these tasks
+    :raises ValueError: if an env is on another task afterwards
+    """
+    env.set_options([{"task": task} for task in tasks])
+    obs = env.reset()
+    check_tasks(env, tasks)
+    assert isinstance(obs, np.ndarray)
+    return obs
 
 
 def set_tasks(env: VecEnv, task_ids: np.ndarray | None, indices: np.ndarray) -> None:

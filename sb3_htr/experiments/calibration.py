@@ -6,7 +6,7 @@ import torch as th
 from sb3_htr.adaptation.loop import adaptation_steps
 from sb3_htr.common.checks import get_task_family, missing_hook
 from sb3_htr.common.type_aliases import Context, Trajectory
-from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.common.vec_env import make_task_vec_env, reset_to_tasks
 from sb3_htr.experiments.cell import KwArgs
 from sb3_htr.htr.episode_store import evenly_spread
 from sb3_htr.pearl.pearl import PEARL
@@ -14,11 +14,9 @@ from sb3_htr.zoo.run.algorithm import Model
 
 # Equal parts of [0, 1]
 N_BINS = 10
-# Adaptation episodes of each task
-N_EPISODES = 20
 
 
-def calibration(model: Model, env_id: str, env_kwargs: KwArgs) -> np.ndarray:
+def calibration(model: Model, env_id: str, env_kwargs: KwArgs, n_episodes: int) -> np.ndarray:
     """
     The model adapts to the validation tasks. Each state that was reached, with each task that was solved, is a pair:
     p(success | s', z), z being the posterior mean given the task's best episode, against whether the state solves the task.
@@ -26,6 +24,7 @@ def calibration(model: Model, env_id: str, env_kwargs: KwArgs) -> np.ndarray:
     :param model: at the end of its training
     :param env_id: registered env
     :param env_kwargs: arguments of the env
+    :param n_episodes: adaptation episodes on a task
     :return: (N_BINS, 3) float64, of the pairs whose probability is in a bin: how many, sum of probabilities, successes. No
         pairs for a model without a reward model, and for a family without successes
     """
@@ -34,9 +33,9 @@ def calibration(model: Model, env_id: str, env_kwargs: KwArgs) -> np.ndarray:
         return np.zeros((N_BINS, 3))
     tasks = family.validation_tasks
     env = make_task_vec_env(env_id, len(tasks), seed=0, env_kwargs=env_kwargs)
-    env.set_options([{"task": task} for task in tasks])
+    obs = reset_to_tasks(env, tasks)
     policy, adaptation = model.policy, model.start_adaptation(len(tasks), generator=th.Generator().manual_seed(0))
-    steps = list(adaptation_steps(env, adaptation, N_EPISODES, policy.unscale_action, adaptation.act))
+    steps = list(adaptation_steps(env, adaptation, n_episodes, policy.unscale_action, adaptation.act, obs))
     # (n_tasks, n_steps, ...) each
     obs, actions, rewards, next_obs, dones = (np.stack(column, axis=1) for column in list(zip(*steps, strict=True))[:5])
     traj = Trajectory(obs, policy.unscale_action(actions), next_obs, np.zeros_like(rewards, dtype=np.float32))

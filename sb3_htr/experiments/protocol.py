@@ -48,7 +48,7 @@ def evaluate(cell: Cell, model: Model, trained_with: Any = None) -> KwArgs:
         ]
         returns, successes = (np.stack(arrays) for arrays in zip(*records, strict=True))
         arrays |= {f"returns_{evaluation.name}": returns.astype(np.float32), f"successes_{evaluation.name}": successes}
-    return {**arrays, "calibration": calibration(model, cell.env_id, cell.env_kwargs)}
+    return {**arrays, "calibration": calibration(model, cell.env_id, cell.env_kwargs, cell.n_episodes)}
 
 
 def _explorer(name: str, trained_with: Any) -> Any:

@@ -498,7 +498,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         # None in files of older versions
         longest = np.inf if self.max_episode_steps is None else ENDLESS * self.max_episode_steps
         length = 0
-        obs = vec_env.reset()
+        obs = np.asarray(vec_env.reset())
         if task is not None and np.ndim(task) > 0:
             checks.check_tasks(vec_env, np.asarray(task, dtype=np.float32)[None])
         elif task is not None:

@@ -13,15 +13,13 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_htr.adaptation.adaptation import Step
 from sb3_htr.adaptation.loop import Watched
 from sb3_htr.common.checks import check_is_env, check_numbers
-from sb3_htr.common.vec_env import in_float32, make_task_vec_env
+from sb3_htr.common.vec_env import N_ENVS, in_float32, make_task_vec_env
 from sb3_htr.rivals.base import Rival, RivalAdaptation
 from sb3_htr.rivals.trial_policy import TrialLstmPolicy
 from sb3_htr.rivals.trials import LastStep, TrialVecEnv
 
 N_EPISODES_PER_TRIAL = 5
 N_TRIALS_PER_BATCH = 4
-# Of an env that is given by its id
-N_ENVS = 20
 
 
 class TrialAdaptation(RivalAdaptation):

@@ -25,12 +25,9 @@ from sb3_htr.common.checks import (
     get_task_family,
 )
 from sb3_htr.common.type_aliases import Trajectory
-from sb3_htr.common.vec_env import in_float32, make_task_vec_env
+from sb3_htr.common.vec_env import N_ENVS, in_float32, make_task_vec_env
 from sb3_htr.rivals.base import Rival, ToldAdaptation, unscaled
 from sb3_htr.rivals.shown_task import ShownTaskVecEnv
-
-# Of an env that is given by its id
-N_ENVS = 20
 
 
 class TaskHerReplayBuffer(HerReplayBuffer):

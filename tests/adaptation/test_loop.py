@@ -43,11 +43,3 @@ def test_each_env_finishes_its_episodes_and_each_step_is_whole() -> None:
             moved = step.observations[i] + 0.1 * step.actions[i]
             np.testing.assert_allclose(step.next_observations[i], moved, atol=1e-6, err_msg="the last one of its episode")
             expected = np.zeros(2) if step.dones[i] else step.next_observations[i]
-
-
-def test_without_a_reset_it_does_one() -> None:
-    env = DummyVecEnv([partial(gym.make, ENV_ID)])
-    env.set_options({"task": np.array([0.0, 0.0])})
-    noting = Noting()
-    steps = list(adaptation_steps(env, noting, 1, lambda actions: actions * 0, noting.act))
-    assert len(steps) == 20 and all(step.rewards[0] == 1 for step in steps)

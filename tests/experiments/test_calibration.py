@@ -10,7 +10,7 @@ from helpers import ENV_ID
 from htr_envs.point_robot import PointRobotDynamics
 from sb3_htr import PEARL
 from sb3_htr.common.vec_env import make_task_vec_env
-from sb3_htr.experiments.calibration import N_BINS, N_EPISODES, calibration, expected_calibration_error
+from sb3_htr.experiments.calibration import N_BINS, calibration, expected_calibration_error
 from sb3_htr.rivals.scripted import ScriptedAgent
 
 
@@ -23,8 +23,8 @@ def model() -> PEARL:
 def test_probabilities_are_compared_with_what_happened(model: PEARL, monkeypatch: pytest.MonkeyPatch) -> None:
     """Goals are so near that their discs overlap at the start: some states solve some tasks."""
     near = {"goal_distance": 0.15, "n_validation_tasks": 6}
-    n, probability, successes = (bins := calibration(model, ENV_ID, near)).T
-    n_solved = n.sum() / (6 * N_EPISODES * 20)
+    n, probability, successes = (bins := calibration(model, ENV_ID, near, 3)).T
+    n_solved = n.sum() / (6 * 3 * 20)
     assert n_solved in range(1, 7) and 0 < successes.sum() < n.sum() and (successes <= n).all()
     edges = np.linspace(0, 1, N_BINS + 1)
     assert (probability >= edges[:-1] * n).all() and (probability <= edges[1:] * n).all()
@@ -33,7 +33,7 @@ def test_probabilities_are_compared_with_what_happened(model: PEARL, monkeypatch
         return th.zeros(*states.shape[:-1], len(tasks))
 
     monkeypatch.setattr(model.policy.reward_model, "success_logits", know_nothing)
-    half = calibration(model, ENV_ID, near)
+    half = calibration(model, ENV_ID, near, 3)
     assert half[N_BINS // 2].tolist() == [n.sum(), n.sum() / 2, successes.sum()] and half.sum() == half[N_BINS // 2].sum()
     assert expected_calibration_error(half) == pytest.approx(abs(0.5 - successes.sum() / n.sum()))
     assert expected_calibration_error(bins) == pytest.approx(np.abs(probability - successes).sum() / n.sum())
@@ -45,7 +45,7 @@ def test_a_success_may_be_worth_0_and_all_else_less(model: PEARL, monkeypatch: p
     def pairs_and_successes() -> list[float]:
         walk = ScriptedAgent.random(make_task_vec_env(ENV_ID).action_space)  # type: ignore[arg-type]
         monkeypatch.setattr(model, "start_adaptation", walk.start_adaptation)
-        return calibration(model, ENV_ID, family)[:, [0, 2]].sum(axis=0).tolist()
+        return calibration(model, ENV_ID, family, 20)[:, [0, 2]].sum(axis=0).tolist()
 
     expected, step = pairs_and_successes(), PointRobotDynamics.step
     assert min(expected) > 0
@@ -59,5 +59,5 @@ def test_a_success_may_be_worth_0_and_all_else_less(model: PEARL, monkeypatch: p
 
 
 def test_a_model_that_solves_nothing_has_no_diagram(model: PEARL) -> None:
-    bins = calibration(model, ENV_ID, {"goal_distance": 9.0})
+    bins = calibration(model, ENV_ID, {"goal_distance": 9.0}, 1)
     assert not bins.any() and np.isnan(expected_calibration_error(bins))

@@ -1,6 +1,7 @@
 """Agents watched and filmed."""
 
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import imageio.v3 as iio
@@ -94,6 +95,20 @@ def test_what_is_played_is_what_is_evaluated(explorer: str) -> None:
     assert moments[-1].successes == tuple(successes[0]) and len(moments) == 7 * 21
     before = [moment.deviation for moment in moments if moment.exploring and not moment.ended]
     assert moments[-1].deviation <= before[0] > 0.1 and (explorer != "prior" or set(before) == {1.0})
+
+
+class Deaf(gym.Wrapper):
+    """Passes no options on."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        return self.env.reset(seed=seed)
+
+
+def test_another_task_than_was_asked_for_is_not_played() -> None:
+    env = gym.make(ENV_ID)
+    tasks = env.unwrapped.task_family.test_tasks  # type: ignore[attr-defined]
+    with pytest.raises(ValueError, match=r"The env was asked for the task .*, and is on"):
+        next(Player(PEARL.load(SHIPPED), Deaf(env)).play(tasks, 1, 1))
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".gif"])

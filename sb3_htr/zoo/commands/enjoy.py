@@ -4,8 +4,7 @@ import argparse
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
-
+from sb3_htr.adaptation.evaluation import task_set
 from sb3_htr.common.checks import check_numbers, get_task_family
 from sb3_htr.zoo.commands.arguments import add_adaptation_arguments, add_agent_arguments, make_parser, parse
 from sb3_htr.zoo.run.agents import TrainedAgent
@@ -49,7 +48,7 @@ def watch(agent: TrainedAgent, args: argparse.Namespace, every: int, show: Show)
     model = agent.load(args.device)
     env = agent.make_env("rgb_array" if every else None)
     player = Player(model, env, args.explorer, not args.stochastic, args.seed, every, agent.around)
-    tasks: np.ndarray = getattr(get_task_family(player.vec_env), f"{args.tasks}_tasks")
+    tasks = task_set(get_task_family(player.vec_env), args.tasks)
     infinity = float("inf")
     check_numbers(**{"--n-episodes": (args.n_episodes, 1, infinity), "--n-tasks": (args.n_tasks, 1, infinity)})
     numbers = args.task or range(1, min(args.n_tasks, len(tasks)) + 1)

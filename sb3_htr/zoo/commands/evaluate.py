@@ -5,9 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from sb3_htr.adaptation.evaluation import AdaptationRecord, record_adaptation
+from sb3_htr.adaptation.evaluation import AdaptationRecord, record_adaptation, task_set
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checks import get_task_family
+from sb3_htr.common.vec_env import N_ENVS
 from sb3_htr.zoo.commands.arguments import add_adaptation_arguments, add_agent_arguments, make_parser, parse
 from sb3_htr.zoo.plots.adaptation import plot_adaptation_curve, plot_adaptation_paths, start_position
 
@@ -40,9 +41,9 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("-o", "--output", type=Path, help="folder for the files (default: the run folder, or ./ENV_ID)")
     args, agent = parse(parser, argv)
     model = agent.load(args.device)
-    env = agent.make_vec_env(20)
+    env = agent.make_vec_env(N_ENVS)
     family = get_task_family(env)
-    tasks = getattr(family, f"{args.tasks}_tasks")
+    tasks = task_set(family, args.tasks)
     explorer = args.explorer or model.explorer.name
     record = record_adaptation(
         model, env, tasks, args.n_episodes, explorer=explorer, deterministic=not args.stochastic, seed=args.seed

@@ -13,6 +13,7 @@ from stable_baselines3 import SAC
 from sb3_htr.adaptation.evaluation import record_adaptation
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checks import get_task_family, keywords_of
+from sb3_htr.common.vec_env import N_ENVS
 from sb3_htr.zoo.commands.arguments import add_agent_arguments, make_parser, parse
 from sb3_htr.zoo.run.agents import RECORD, TrainedAgent
 from sb3_htr.zoo.run.hub import CARD, FILM, files, model_name, push
@@ -109,7 +110,7 @@ def main(argv: Sequence[str]) -> None:
     if alone:
         return
     exported = dataclasses.replace(agent, path=file, record=record, folder=None)
-    model, env = exported.load(), exported.make_vec_env(20)
+    model, env = exported.load(), exported.make_vec_env(N_ENVS)
     tasks = get_task_family(env).test_tasks
     explorers = dict.fromkeys([model.explorer.name, *exported.algorithm.also_explores_by])
     scores = {explorer: record_adaptation(model, env, tasks, args.n_episodes, explorer=explorer) for explorer in explorers}

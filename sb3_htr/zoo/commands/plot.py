@@ -10,9 +10,10 @@ import numpy as np
 import torch as th
 
 from sb3_htr.adaptation.adaptation import Adaptation
-from sb3_htr.adaptation.evaluation import AdaptationRecord, run_adaptation
+from sb3_htr.adaptation.evaluation import AdaptationRecord, run_adaptation, task_set
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.checks import get_task_family
+from sb3_htr.common.vec_env import reset_to_tasks
 from sb3_htr.zoo.commands.arguments import add_adaptation_arguments, add_agent_arguments, chosen_agent, make_parser
 from sb3_htr.zoo.plots.adaptation import plot_adaptation_curve, plot_adaptation_paths, start_position
 from sb3_htr.zoo.plots.curves import Curve, plot_curves
@@ -72,12 +73,12 @@ def adapt(agent: TrainedAgent, args: argparse.Namespace) -> Adapted:
     print(f"Adapting {agent.path}")
     model = agent.load(args.device)
     family = get_task_family(agent.make_vec_env(1))
-    tasks: np.ndarray = getattr(family, f"{args.tasks}_tasks")
+    tasks = task_set(family, args.tasks)
     env = agent.make_vec_env(len(tasks))
     env.seed(args.seed)
-    env.set_options([{"task": task} for task in tasks])
+    obs = reset_to_tasks(env, tasks)
     adaptation = model.start_adaptation(len(tasks), args.explorer, th.Generator().manual_seed(args.seed))
-    record = run_adaptation(model.policy, env, adaptation, args.n_episodes, not args.stochastic, args.seed)
+    record = run_adaptation(model.policy, env, adaptation, obs, args.n_episodes, not args.stochastic, args.seed)
     latent = None
     if isinstance(adaptation, Adaptation):
         particles = adaptation.knowledge.particles()

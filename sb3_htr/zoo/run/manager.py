@@ -36,7 +36,7 @@ from sb3_htr.common.atomic import WRITE_ERRORS, atomic_path, reason
 from sb3_htr.common.checks import check_keywords, check_numbers, keywords_of
 from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.resume import CheckpointCallback, checkpoints, cut_monitor_files, load_latest
-from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
 from sb3_htr.common.versions import differences, made_by
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.pearl.divergence import DivergedError
@@ -54,8 +54,6 @@ from sb3_htr.zoo.run.trust import PACKAGES, plain_settings, refuse
 
 # What a YAML file may have beside the arguments of the algorithm
 ZOO_SETTINGS = ("n_envs", "n_timesteps", "env_wrapper", "vec_env_wrapper", "callback", "env_kwargs")
-# Tasks that an evaluation adapts to side by side
-N_EVAL_ENVS = 20
 
 
 class MetaExperimentManager(ExperimentManager):
@@ -175,7 +173,7 @@ class MetaExperimentManager(ExperimentManager):
         no_log = no_log or self.optimize_hyperparameters or eval_env
         env = make_task_vec_env(
             self.env_name.gym_id,
-            N_EVAL_ENVS if eval_env else n_envs,
+            N_ENVS if eval_env else n_envs,
             seed=self.seed,
             monitor_dir=None if no_log else self.save_path,
             env_kwargs=self.eval_env_kwargs if eval_env else self.env_kwargs,

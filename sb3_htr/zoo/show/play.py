@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_htr.adaptation.evaluation import MetaLearner
 from sb3_htr.adaptation.loop import adaptation_steps
+from sb3_htr.common.vec_env import reset_to_tasks
 
 
 @dataclass(frozen=True)
@@ -141,9 +142,8 @@ class Player:
             successes.append(False)
             return moment(0, exploring, False)
 
-        env.set_options({"task": tasks[number - 1]})
         self.camera.frames.clear()
-        obs, n_steps, exploring = env.reset(), 0, bool(adaptation.exploring()[0])
+        obs, n_steps, exploring = reset_to_tasks(env, tasks[[number - 1]]), 0, bool(adaptation.exploring()[0])
         yield begin()
         act = partial(adaptation.act, deterministic=self.deterministic)
         for step in adaptation_steps(env, adaptation, n_episodes, policy.unscale_action, act, obs):
