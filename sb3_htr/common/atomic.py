@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from uuid import uuid4
 
+from sb3_htr.common.errors import last_line
+
 # What writing a file can end in: a full disk (of which torch makes a RuntimeError), a clock that zip files do not know
 WRITE_ERRORS = (OSError, RuntimeError, ValueError, struct.error)
 
@@ -20,7 +22,7 @@ def reason(error: Exception) -> str:
     """
     if isinstance(error, RuntimeError):
         return "torch could not write it, as on a full disk"
-    return (isinstance(error, OSError) and error.strerror) or str(error).splitlines()[0][:200]
+    return (isinstance(error, OSError) and error.strerror) or last_line(error)
 
 
 @contextmanager

@@ -1,10 +1,12 @@
 """Tensors, numbers and text from files of unknown origin."""
 
+import io
+import json
 import os
 import pickletools
 import re
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import IO, Any
 
 import torch as th
@@ -13,6 +15,29 @@ import torch as th
 MAX_BYTES = 2**30
 # What its pickle may call, beside types of storages
 CALLED = ("torch._utils _rebuild_tensor_v2", "collections OrderedDict")
+
+
+class Refused(ValueError):
+    """A file whose content is read, and not wanted: its words are our own."""
+
+
+def read_model(path: str | os.PathLike[str], names: Iterable[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """
+    Read a model file without running code of it.
+
+    :param path: file of SB3's ``save``
+    :param names: of the weights in it
+    :return: its settings, where what is no plain JSON is text, and state dicts by name
+    :raises ValueError: as :func:`load_plain`
+    :raises Exception: of many kinds, for a file that is damaged or of another kind
+    """
+    with zipfile.ZipFile(path) as archive:
+        _check_size(archive)
+        data = json.loads(archive.read("data"))
+        weights = {name: load_plain(io.BytesIO(archive.read(f"{name}.pth"))) for name in names}
+    if not all(isinstance(value, dict) for value in (data, *weights.values())):
+        raise TypeError
+    return data, weights
 
 
 def load_plain(file: str | os.PathLike[str] | IO[bytes]) -> Any:
@@ -26,12 +51,10 @@ def load_plain(file: str | os.PathLike[str] | IO[bytes]) -> Any:
     :raises Exception: of many kinds, for a file that is damaged or of another kind
     """
     with zipfile.ZipFile(file) as archive:
-        size = sum(info.file_size for info in archive.infolist())
-        if size > MAX_BYTES:
-            raise ValueError(f"it unpacks to more than {MAX_BYTES} bytes.")
+        size = _check_size(archive)
         # torch does not look at the checksums
         if archive.testzip() is not None:
-            raise ValueError("it is not what was written.")
+            raise Refused("it is not what was written.")
         for name in archive.namelist():
             if name.endswith("data.pkl"):
                 _check_pickle(archive.read(name))
@@ -43,8 +66,16 @@ def load_plain(file: str | os.PathLike[str] | IO[bytes]) -> Any:
     tensors = list(_tensors(content))
     enlarged = any(tensor.nbytes > tensor.untyped_storage().nbytes() for tensor in tensors)
     if enlarged or sum(tensor.nbytes for tensor in tensors) > 2 * size:
-        raise ValueError("its tensors are larger than what is stored of them.")
+        raise Refused("its tensors are larger than what is stored of them.")
     return content
+
+
+def _check_size(archive: zipfile.ZipFile) -> int:
+    """Bytes that it unpacks to."""
+    size = sum(info.file_size for info in archive.infolist())
+    if size > MAX_BYTES:
+        raise Refused(f"it unpacks to more than {MAX_BYTES} bytes.")
+    return size
 
 
 def _check_pickle(data: bytes) -> None:
@@ -52,7 +83,7 @@ def _check_pickle(data: bytes) -> None:
     for opcode, argument, _ in pickletools.genops(data):
         named = opcode.name == "GLOBAL" and (argument in CALLED or re.fullmatch(r"torch \w+Storage", str(argument)))
         if opcode.name in ("STACK_GLOBAL", "INST", "OBJ", "EXT1", "EXT2", "EXT4") or (opcode.name == "GLOBAL" and not named):
-            raise ValueError("it calls what no tensor needs.")
+            raise Refused("it calls what no tensor needs.")
 
 
 def _tensors(content: Any) -> Iterator[th.Tensor]:

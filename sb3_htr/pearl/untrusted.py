@@ -1,10 +1,7 @@
 """Models of unknown origin."""
 
-import io
-import json
 import os
 import re
-import zipfile
 from typing import Any
 
 import torch as th
@@ -12,7 +9,8 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_htr.common.plain import MAX_BYTES, load_plain
+from sb3_htr.common.errors import last_line
+from sb3_htr.common.plain import Refused, read_model
 from sb3_htr.common.saving import with_suffix
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.pearl.encoder import ENCODERS
@@ -62,7 +60,7 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
     # As SB3's load does
     path = path if os.path.exists(path) else with_suffix(path, ".zip")
     try:
-        data, weights = _read(path)
+        data, weights = read_model(path, ("policy", "knowledge"))
         settings: dict[str, Any] = {name: _plain(data[name]) for name in EXPLORERS}
         settings |= {name: data[name] for name in NUMBERS if type(data.get(name)) in (int, float)}
         settings |= {name: data[name] for name, words in WORDS.items() if re.fullmatch(words, str(data.get(name)))}
@@ -72,13 +70,13 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
         settings["replay_buffer_kwargs"] = {name: replay[name] for name in REPLAY if name in replay and PICKLED not in replay}
         for name, most in (("context_size", MAX_CONTEXT), ("buffer_size", MAX_BUFFER)):
             if settings.get(name, 0) > most:
-                raise ValueError(f"PEARL has no {name} of {settings[name]} here: expected {most} at most.")
+                raise Refused(f"PEARL has no {name} of {settings[name]} here: expected {most} at most.")
         counters = {name: data[name] for name in COUNTERS if type(data.get(name)) is int}
         settings["policy_kwargs"] = _policy_kwargs(data.get("policy_kwargs", {}))
     except FileNotFoundError:
         raise
     except Exception as error:  # whatever a stranger can put into a file
-        why = f": {error}" if isinstance(error, ValueError) and "PEARL" in str(error) else "."
+        why = f": {error}" if isinstance(error, Refused) else "."
         raise ValueError(f"{path} is damaged, or no model saved by PEARL: nothing of it was loaded{why}") from None
     if isinstance(env, str):
         env = make_task_vec_env(env)
@@ -90,21 +88,10 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
         model.policy.load_state_dict(weights["policy"])
         model.knowledge.load_state_dict(weights["knowledge"])
     except (RuntimeError, TypeError, AttributeError) as error:
-        raise ValueError(f"The weights in {path} do not fit the env or the settings: {_last_line(error)}") from None
+        raise ValueError(f"The weights in {path} do not fit the env or the settings: {last_line(error)}") from None
     for name, value in counters.items():
         setattr(model, name, value)
     return model
-
-
-def _read(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, Any]]:
-    with zipfile.ZipFile(path) as archive:
-        if sum(info.file_size for info in archive.infolist()) > MAX_BYTES:
-            raise ValueError(f"PEARL's files do not unpack to more than {MAX_BYTES} bytes.")
-        data = json.loads(archive.read("data"))
-        weights = {name: load_plain(io.BytesIO(archive.read(f"{name}.pth"))) for name in ("policy", "knowledge")}
-    if not all(isinstance(value, dict) for value in (data, *weights.values())):
-        raise TypeError
-    return data, weights
 
 
 def _plain(explorer: dict[str, Any]) -> dict[str, Any]:
@@ -127,13 +114,13 @@ def _policy_kwargs(given: dict[str, Any]) -> dict[str, Any]:
         known.add("encoder_class")
     unknown = [name for name in given if name not in known]
     if any(not name.startswith(":") for name in unknown):
-        raise ValueError(
+        raise Refused(
             f"its policy has the setting {unknown[0]!r}, which only PEARL.load restores, and that may run code of the file."
         )
     kwargs = {name: value for name, value in given.items() if name not in unknown}
     for units in (kwargs.get("net_arch", []), kwargs.get("encoder_arch", []), [kwargs.get("latent_dim", 1)]):
         if len(units) > MAX_LAYERS or not all(type(unit) is int and 1 <= unit <= MAX_UNITS for unit in units):
-            raise ValueError(f"PEARL's networks do not have layers of {units} units.")
+            raise Refused(f"PEARL's networks do not have layers of {units} units.")
     return {**kwargs, "normalize_observations": bool(kwargs.get("normalize_observations", True))}
 
 
@@ -149,7 +136,3 @@ def _check_shapes(path: str | os.PathLike[str], weights: dict[str, Any], env: Gy
                 f"The weights in {path} do not fit the env or the settings: {name} has shape {there and tuple(there)}, "
                 f"expected {here and tuple(here)}."
             )
-
-
-def _last_line(error: Exception) -> str:
-    return (str(error).splitlines() or [""])[-1].strip()[:200]

@@ -1,15 +1,13 @@
 """Rivals of unknown origin."""
 
 import copy
-import io
-import json
-import zipfile
 from pathlib import Path
 from typing import Any, TypeVar
 
 import gymnasium as gym
 
-from sb3_htr.common.plain import MAX_BYTES, load_plain
+from sb3_htr.common.errors import last_line
+from sb3_htr.common.plain import read_model
 from sb3_htr.rivals.base import Rival
 
 SelfRival = TypeVar("SelfRival", bound=Rival)
@@ -37,11 +35,8 @@ def load_untrusted(
     :raises ValueError: if it is no such file, or its weights do not fit the settings
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            if sum(info.file_size for info in archive.infolist()) > MAX_BYTES:
-                raise ValueError(f"it unpacks to more than {MAX_BYTES} bytes")
-            n_steps = json.loads(archive.read("data"))["num_timesteps"]
-            weights = load_plain(io.BytesIO(archive.read("policy.pth")))
+        data, weights = read_model(path, ["policy"])
+        n_steps = data["num_timesteps"]
         # A copy, because SB3 adds to it
         policy_kwargs = copy.deepcopy(hyperparams.get("policy_kwargs", {}))
         counts = {name: hyperparams[name] for name in model_class.ACTS_BY if name in hyperparams}
@@ -55,9 +50,9 @@ def load_untrusted(
                 )
         settings = {**counts, **model_class.ACTS_WITH}
         model = model_class(model_class.DEFAULT_POLICY, env, device=device, policy_kwargs=policy_kwargs, **settings)
-        model.policy.load_state_dict(weights)
+        model.policy.load_state_dict(weights["policy"])
     except Exception as error:  # whatever a stranger can put into a file
-        why = str(error).splitlines()[-1].strip()[:200] if isinstance(error, ValueError | RuntimeError) and str(error) else ""
+        why = last_line(error) if isinstance(error, ValueError | RuntimeError) else ""
         raise ValueError(f"{path} is damaged, or no {model_class.__name__} with the settings of its record: {why}") from None
     model.num_timesteps = n_steps
     return model

@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr.common.checks import check_device
+from sb3_htr.common.errors import last_line
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.zoo.run.algorithm import Algorithm, Model
 from sb3_htr.zoo.run.folder import run_number
@@ -85,9 +86,8 @@ class TrainedAgent:
             return self.algorithm.load(self.path, self.record, self.make_env(), device, self.trusted)
         except RuntimeError as error:
             writer = self.record.get("versions", {}).get("sb3_htr", "unknown")
-            reason = str(error).splitlines()[-1].strip()[:200]
             raise ValueError(
-                f"{self.path} has other networks than this version makes (it is of sb3_htr {writer}): {reason}"
+                f"{self.path} has other networks than this version makes (it is of sb3_htr {writer}): {last_line(error)}"
             ) from None
 
     def make_env(self, render_mode: str | None = None) -> gym.Env:

@@ -1,0 +1,9 @@
+"""What an error says, in one line."""
+
+
+def last_line(error: Exception) -> str:
+    """
+    :param error: torch's say what is wrong in their last line
+    :return: that line, of 200 characters at most; the type of an error that says nothing
+    """
+    return (str(error).splitlines() or [type(error).__name__])[-1].strip()[:200]
