@@ -9,7 +9,6 @@ from torch import nn
 from sb3_htr.adaptation.policy import ContextualPolicy
 from sb3_htr.adaptation.reward_watch import RewardWatch
 from sb3_htr.adaptation.task_bank import MAX_HINDSIGHT_TASKS, MAX_TRAIN_TASKS, TaskBank
-from sb3_htr.common.type_aliases import Context
 
 # Quantiles of what unrewarded and rewarded steps return beside what the model says is task-free; rewards are told from the
 # model's errors by the middle between the two
@@ -138,9 +137,7 @@ class LatentKnowledge(nn.Module):
         data = th.as_tensor(solved.rows, device=policy.device)
         lengths = th.as_tensor(solved.lengths, device=policy.device)
         action, reward = data[:, columns.action], data[:, columns.reward]
-        context = Context(data[:, columns.observation], action, reward, lengths)
-        state = policy.extend_posterior(policy.encoder.empty(len(lengths)), context)
-        z, _ = policy.encoder.posterior(state)
+        z, _ = policy.infer(columns.context(solved.rows, solved.lengths, policy.device))
         obs, next_obs = (policy.normalize(data[:, column]) for column in (columns.observation, columns.next_observation))
         # Of the steps that are rewarded: chance of a reward, and reward to be expected, under each task
         success = th.as_tensor(solved.success, device=policy.device)

@@ -6,6 +6,7 @@ import numpy as np
 import torch as th
 
 from sb3_htr.common.type_aliases import Context
+from sb3_htr.htr.relabel.base import AdaptingPolicy
 
 
 class Encoder(Protocol):
@@ -28,7 +29,7 @@ class Encoder(Protocol):
         ...
 
 
-class ContextualPolicy(Protocol):
+class ContextualPolicy(AdaptingPolicy, Protocol):
     """Actor, critics, encoder and a model of rewards; :class:`sb3_htr.pearl.policies.PEARLPolicy` is one."""
 
     latent_dim: int
@@ -39,21 +40,12 @@ class ContextualPolicy(Protocol):
         """Infers z."""
         ...
 
-    @property
-    def device(self) -> th.device:
-        """Where the networks are."""
-        ...
-
     def extend_posterior(self, state: th.Tensor, context: Context) -> th.Tensor:
         """What the encoder's ``extend`` does, for transitions as they were collected."""
         ...
 
     def normalize(self, obs: th.Tensor) -> th.Tensor:
         """Observations as all networks see them."""
-        ...
-
-    def values(self, obs: np.ndarray, z: th.Tensor) -> th.Tensor:
-        """Values (n, k) of acting with task variables (n, k, latent_dim) in observations (n, obs_dim)."""
         ...
 
     def act(self, obs: np.ndarray, z: np.ndarray, deterministic: bool = False) -> np.ndarray:

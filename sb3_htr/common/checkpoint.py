@@ -36,11 +36,10 @@ def write_checkpoint(folder: str | os.PathLike[str], state: dict[str, Any]) -> N
         (temporary / MANIFEST).write_text(json.dumps(manifest, indent=1))
 
 
-def read_checkpoint(folder: str | os.PathLike[str], device: th.device | str = "cpu") -> dict[str, Any]:
+def read_checkpoint(folder: str | os.PathLike[str]) -> dict[str, Any]:
     """
     :param folder: of :func:`write_checkpoint`
-    :param device: where tensors are put
-    :return: the state
+    :return: the state, on the CPU
     :raises DamagedCheckpoint: if it is incomplete, changed, or of another format
     """
     folder = Path(folder)
@@ -59,7 +58,7 @@ def read_checkpoint(folder: str | os.PathLike[str], device: th.device | str = "c
     if not intact:
         raise DamagedCheckpoint(f"{folder / STATE} is missing or not what was written: the checkpoint is damaged.")
     try:
-        state: dict[str, Any] = th.load(folder / STATE, map_location=device, weights_only=True)
+        state: dict[str, Any] = th.load(folder / STATE, map_location="cpu", weights_only=True)
     except Exception:  # whatever a stranger can put into a file, with its checksum beside it
         raise DamagedCheckpoint(f"{folder / STATE} is not what sb3-htr writes, and may run code: it was not read.") from None
     return state

@@ -36,8 +36,12 @@ def checkpoints(run: Path) -> list[Path]:
     :param run: folder of a run
     :return: its checkpoints, the latest first
     """
-    folders = [path for path in (run / "checkpoints").glob("*_steps") if path.name.split("_")[0].isdecimal()]
-    return sorted(folders, key=lambda path: int(path.name.split("_")[0]), reverse=True)
+    folders = [path for path in (run / "checkpoints").glob("*_steps") if path.name.removesuffix("_steps").isdecimal()]
+    return sorted(folders, key=_n_steps, reverse=True)
+
+
+def _n_steps(checkpoint: Path) -> int:
+    return int(checkpoint.name.removesuffix("_steps"))
 
 
 def n_steps_done(run: Path) -> int:
@@ -45,19 +49,18 @@ def n_steps_done(run: Path) -> int:
     :param run: folder of a run
     :return: env steps before its latest checkpoint, 0 without one
     """
-    return max((int(path.name.split("_")[0]) for path in checkpoints(run)), default=0)
+    return next(map(_n_steps, checkpoints(run)), 0)
 
 
-def load_latest(run: Path, device: str = "cpu") -> tuple[Path, dict[str, Any]]:
+def load_latest(run: Path) -> tuple[Path, dict[str, Any]]:
     """
     :param run: folder of a run
-    :param device: where tensors are put
     :return: the latest checkpoint that is whole, and its state; those that are not are warned of
     :raises FileNotFoundError: if there is none
     """
     for folder in checkpoints(run):
         try:
-            return folder, read_checkpoint(folder, device)
+            return folder, read_checkpoint(folder)
         except DamagedCheckpoint as error:
             warnings.warn(f"{error} The next older checkpoint is tried.", stacklevel=2)
     raise FileNotFoundError(f"There is no checkpoint to go on from in {run / 'checkpoints'}: train again, with --save-freq.")
@@ -167,7 +170,7 @@ class CheckpointCallback(BaseCallback):
                 self.model._num_timesteps_at_start = self._pending["num_timesteps_at_start"]
             self._pending = None
             return
-        beyond = [folder for folder in checkpoints(self.run) if int(folder.name.split("_")[0]) > self.num_timesteps]
+        beyond = [folder for folder in checkpoints(self.run) if _n_steps(folder) > self.num_timesteps]
         if beyond:
             raise ValueError(
                 f"{beyond[0]} is a checkpoint of another training, which went further, and the older checkpoints in a folder "

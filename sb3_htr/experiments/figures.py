@@ -42,6 +42,10 @@ def n_seeds(results: Results) -> int:
     return len({cell.seed for cell in results})
 
 
+def _title(results: Results) -> str:
+    return f"{next(iter(results)).env_id}: IQM over {n_seeds(results)} seeds, 95 % interval"
+
+
 def label(variant: str, runs: list[tuple[Cell, Any]], results: Results) -> str:
     """
     :param variant: its name
@@ -78,7 +82,7 @@ def learning(results: Results, path: Path) -> None:
     right.set_ylabel("return")
     right.xaxis.get_major_locator().set_params(integer=True)
     right.set_title("test tasks, final models", fontsize=10)
-    finish(figure, path, f"{next(iter(results)).env_id}: IQM over {n_seeds(results)} seeds, 95 % interval")
+    finish(figure, path, _title(results))
 
 
 def race(results: Results, path: Path) -> None:
@@ -102,7 +106,7 @@ def race(results: Results, path: Path) -> None:
     left.set_xlabel("thousand env steps of meta-training")
     right.set_xlabel("minutes of meta-training, with evaluations")
     left.set_ylabel("validation tasks solved in the last episode (%)")
-    finish(figure, path, f"{next(iter(results)).env_id}: IQM over {n_seeds(results)} seeds, 95 % interval")
+    finish(figure, path, _title(results))
 
 
 def optimal_return(goal_distance: float, max_episode_steps: int) -> float:
@@ -147,7 +151,7 @@ def goal_distance(results: Results, path: Path) -> None:
     for axes in (left, right):
         axes.set_xlabel("distance of the goals (1.5: 30 steps, 2: 40 steps, else 20)")
         axes.set_ylim(-0.03, 1.05)
-    finish(figure, path, f"{next(iter(results)).env_id}: IQM over {n_seeds(results)} seeds, 95 % interval")
+    finish(figure, path, _title(results))
 
 
 def relabelling(results: Results, path: Path) -> None:
@@ -161,9 +165,7 @@ def relabelling(results: Results, path: Path) -> None:
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
     probabilities = sorted(float(variant.removeprefix("K = ")) for variant in groups if variant.startswith("K = "))
     returns = [scores(groups[f"K = {k:g}"], "last_episode_return", "belief") for k in probabilities]
-    points = np.array([iqm_interval(values) for values in returns])
-    left.plot(probabilities, points[:, 0], "o-", color=COLOURS[0], label="IQM and 95 % interval")
-    left.fill_between(probabilities, points[:, 1], points[:, 2], color=COLOURS[0], alpha=0.2, linewidth=0)
+    band(left, np.array(probabilities), np.stack(returns, axis=-1), COLOURS[0], "-", "IQM and 95 % interval")
     for k, values in zip(probabilities, returns, strict=True):
         label = "one seed" if k == 0 else None
         left.plot([k] * len(values), values.mean(axis=(1, 2)), "o", color=COLOURS[6], markersize=3, label=label)
@@ -177,7 +179,7 @@ def relabelling(results: Results, path: Path) -> None:
     right.set_xlabel("thousand env steps of meta-training")
     right.set_ylabel("return of the last adaptation episode")
     right.set_title("validation tasks, hindsight task strategies and ablation", fontsize=10)
-    finish(figure, path, f"{next(iter(results)).env_id}: IQM over {n_seeds(results)} seeds, 95 % interval")
+    finish(figure, path, _title(results))
 
 
 def evaluations(results: Results, path: Path) -> None:
@@ -205,7 +207,7 @@ def evaluations(results: Results, path: Path) -> None:
     grid[0, 0].set_yticks(range(len(explorers)), explorers)
     grid[0, 0].invert_yaxis()
     figure.supxlabel("return of the last adaptation episode", fontsize=10)
-    figure.suptitle(f"{cell.env_id}: IQM over {n_seeds(results)} seeds, 95 % interval", fontsize=11)
+    figure.suptitle(_title(results), fontsize=11)
     save(figure, path)
 
 

@@ -13,7 +13,7 @@ from sb3_htr.common.checks import check_has_hooks, check_numbers, check_same_fam
 from sb3_htr.common.random_state import get_generator_state, set_generator_state
 from sb3_htr.common.settings import make
 from sb3_htr.common.task_reward import ROUNDING, task_reward
-from sb3_htr.common.type_aliases import Context, MultiTaskSamples, RewardLabels, TaskFamily
+from sb3_htr.common.type_aliases import MultiTaskSamples, RewardLabels, TaskFamily
 from sb3_htr.htr.episode_store import EpisodeStore
 from sb3_htr.htr.n_step import n_step_returns, steps_ahead
 from sb3_htr.htr.relabel import RELABELLERS, Relabeller
@@ -391,12 +391,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         returns, discounts = n_step_returns(steps[..., columns.reward], n_ahead, gamma)
         beside = first[:, columns.reward] - first[:, columns.task_free_reward]
         return MultiTaskSamples(
-            context=Context(
-                observations=self._tensor(context_rows[:, columns.observation]),
-                actions=self._tensor(context_rows[:, columns.action]),
-                rewards=self._tensor(context_rows[:, columns.reward]),
-                lengths=self._tensor(n_context),
-            ),
+            context=columns.context(context_rows, n_context, self.device),
             observations=self._tensor(first[:, columns.observation]),
             actions=self._tensor(first[:, columns.action]),
             next_observations=self._tensor(last[:, columns.next_observation]),

@@ -1,9 +1,10 @@
 """How a transition is stored: as one row of float32 columns."""
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 
-from sb3_htr.common.type_aliases import Trajectory
+from sb3_htr.common.type_aliases import Context, Trajectory
 
 
 class Transitions:
@@ -36,3 +37,13 @@ class Transitions:
             next_observations=rows[..., self.next_observation],
             task_free_reward=rows[..., self.task_free_reward],
         )
+
+    def context(self, rows: np.ndarray, lengths: np.ndarray, device: th.device | str) -> Context:
+        """
+        :param rows: (n, width) stored transitions, those of the first task first
+        :param lengths: (n_tasks,) int64, how many are of each task
+        :param device: where the context is put
+        :return: what a posterior is inferred from
+        """
+        arrays = rows[:, self.observation], rows[:, self.action], rows[:, self.reward], lengths
+        return Context(*(th.as_tensor(array, device=device) for array in arrays))

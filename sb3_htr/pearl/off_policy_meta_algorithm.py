@@ -143,17 +143,15 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         if self.env is None:
             # Loaded for prediction only: SB3 wants a buffer, we want no memory of it
             self.replay_buffer = ReplayBuffer(1, self.observation_space, self.action_space)  # type: ignore[assignment]
-            with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", "`n_steps=")
-                super()._setup_model()
-            self.replay_buffer = None
         else:
             self._check_rollouts()
             self._setup_replay(self.env)
-            with warnings.catch_warnings():
-                # SB3 does not know that this buffer has them
-                warnings.filterwarnings("ignore", "`n_steps=")
-                super()._setup_model()
+        with warnings.catch_warnings():
+            # SB3 does not know that this buffer has them
+            warnings.filterwarnings("ignore", "`n_steps=")
+            super()._setup_model()
+        if self.env is None:
+            self.replay_buffer = None
         self.knowledge = LatentKnowledge(self.policy.latent_dim).to(self.device)
         self._introduce_policy()
 

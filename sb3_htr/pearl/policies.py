@@ -13,7 +13,6 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, SACPolicy
 from torch import nn
 
-from sb3_htr.adaptation.context import context_dim, context_rows
 from sb3_htr.common.checks import check_numbers
 from sb3_htr.common.latent_policy import LatentPolicy
 from sb3_htr.common.linear import Linear, Stack, with_fast_layers
@@ -41,11 +40,10 @@ class LatentCritic(BaseModel):
         observation_space: spaces.Box,
         action_space: spaces.Box,
         net_arch: list[int],
-        activation_fn: type[nn.Module] = nn.ReLU,
-        n_critics: int = 2,
+        activation_fn: type[nn.Module],
+        n_critics: int,
     ) -> None:
         super().__init__(observation_space, action_space)
-        self.n_critics = n_critics
         units = [observation_space.shape[0] + action_space.shape[0], *net_arch]
 
         def network() -> Stack:
@@ -107,7 +105,7 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
         self.encoder_class = to_encoder_class(encoder_class)
         self.normalize_observations = normalize_observations
         obs_dim, action_dim = (int(np.prod(space.shape)) for space in (observation_space, action_space))
-        self.obs_dim, self.context_dim = obs_dim, context_dim(obs_dim, action_dim)
+        self.obs_dim, self.action_dim = obs_dim, action_dim
         # SB3's networks are built for the observation (o, z)
         super().__init__(
             spaces.Box(-np.inf, np.inf, (obs_dim + latent_dim,), np.float32),
@@ -129,8 +127,9 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
         self.normalizer = ObservationNormalizer(self.obs_dim) if self.normalize_observations else None
-        self.encoder = self.encoder_class(self.context_dim, self.latent_dim, self.encoder_arch, self.activation_fn)
-        self.reward_model = RewardModel(self.obs_dim, self.context_dim - self.obs_dim - 1, self.latent_dim)
+        context_dim = self.obs_dim + self.action_dim + 1
+        self.encoder = self.encoder_class(context_dim, self.latent_dim, self.encoder_arch, self.activation_fn)
+        self.reward_model = RewardModel(self.obs_dim, self.action_dim, self.latent_dim)
         for network in (self.encoder, self.reward_model):
             network.optimizer = self.optimizer_class(
                 network.parameters(),
@@ -196,7 +195,8 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
         :param context: transitions as they were collected
         :return: (n_tasks, ...), with these taken in
         """
-        return self.encoder.extend(state, context_rows(context, self.normalize), context.lengths)
+        rows = th.cat([self.normalize(context.observations), context.actions, context.rewards[:, None]], dim=1)
+        return self.encoder.extend(state, rows, context.lengths)
 
     def infer(self, context: Context) -> tuple[th.Tensor, th.Tensor]:
         """

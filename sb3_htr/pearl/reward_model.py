@@ -8,6 +8,8 @@ from torch.nn import functional as F
 from sb3_htr.common.linear import with_fast_layers
 from sb3_htr.common.type_aliases import RewardLabels
 
+# Dimension of an embedding, hidden units of the towers; the task-free part has half of them
+WIDTH, HIDDEN = 32, 128
 # Of the reward of a success, relative to its mean: no model is more exact than that
 MIN_LOG_STD = -3.5
 # How fast the mean reward of a success is followed
@@ -30,19 +32,16 @@ class RewardModel(nn.Module):
     :param obs_dim: length of an observation
     :param action_dim: length of an action
     :param latent_dim: dimension of z
-    :param width: dimension of an embedding
-    :param hidden: hidden units of the towers; the task-free part has half of them
     """
 
     optimizer: th.optim.Optimizer
     scale: th.Tensor
 
-    def __init__(self, obs_dim: int, action_dim: int, latent_dim: int, width: int = 32, hidden: int = 128) -> None:
+    def __init__(self, obs_dim: int, action_dim: int, latent_dim: int) -> None:
         super().__init__()
-        self.width = width
-        self.state_tower = _mlp(obs_dim, [hidden] * 2, 2 * width)
-        self.task_tower = _mlp(latent_dim, [hidden] * 2, 2 * width + 1)
-        self.task_free_net = _mlp(2 * obs_dim + action_dim, [hidden // 2] * 2, 1)
+        self.state_tower = _mlp(obs_dim, [HIDDEN] * 2, 2 * WIDTH)
+        self.task_tower = _mlp(latent_dim, [HIDDEN] * 2, 2 * WIDTH + 1)
+        self.task_free_net = _mlp(2 * obs_dim + action_dim, [HIDDEN // 2] * 2, 1)
         self.raw_sharpness = nn.Parameter(th.tensor(3.0))
         self.log_std = nn.Parameter(th.tensor(-1.0))
         # Mean reward of a success, 0 before the first
@@ -64,20 +63,20 @@ class RewardModel(nn.Module):
 
     def success_logits(self, states: th.Tensor, tasks: th.Tensor) -> th.Tensor:
         """
-        :param states: (..., n, 2 * width), of the state tower
-        :param tasks: (..., m, 2 * width + 1), of the task tower
+        :param states: (..., n, 2 * WIDTH), of the state tower
+        :param tasks: (..., m, 2 * WIDTH + 1), of the task tower
         :return: (..., n, m), logit of the probability that a state solves a task
         """
-        distance = _squared_distance(states[..., : self.width], tasks[..., : self.width])
+        distance = _squared_distance(states[..., :WIDTH], tasks[..., :WIDTH])
         return F.softplus(self.raw_sharpness) * (1 - distance)
 
     def success_rewards(self, states: th.Tensor, tasks: th.Tensor) -> th.Tensor:
         """
-        :param states: (..., n, 2 * width), of the state tower
-        :param tasks: (..., m, 2 * width + 1), of the task tower
+        :param states: (..., n, 2 * WIDTH), of the state tower
+        :param tasks: (..., m, 2 * WIDTH + 1), of the task tower
         :return: (..., n, m), mean reward, beside the task-free one, where a state solves a task
         """
-        distance = _squared_distance(states[..., self.width :], tasks[..., self.width : -1])
+        distance = _squared_distance(states[..., WIDTH:], tasks[..., WIDTH:-1])
         return tasks[..., None, :, -1] - (distance.clamp(min=0) + 1e-4).sqrt()
 
     def losses(self, next_obs: th.Tensor, z: th.Tensor, labels: RewardLabels) -> tuple[th.Tensor, th.Tensor]:

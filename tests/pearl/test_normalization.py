@@ -68,6 +68,19 @@ def test_every_network_sees_normalized_observations(trained: PEARL, tiny_pearl: 
         th.testing.assert_close(x, y, rtol=1e-4, atol=1e-5)
 
 
+def test_a_context_row_is_observation_action_reward(trained: PEARL, monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[th.Tensor] = []
+
+    def extend(state: th.Tensor, rows: th.Tensor, lengths: th.Tensor) -> th.Tensor:
+        read.append(rows)
+        return state
+
+    monkeypatch.setattr(trained.policy.encoder, "extend", extend)
+    obs, actions = th.tensor([[0.3, 0.2]]), th.tensor([[-0.5, 1.0]])
+    trained.policy.infer(Context(obs, actions, th.tensor([6.0]), th.tensor([1])))
+    assert th.equal(read[0], th.cat([normalizer(trained)(obs), actions, th.tensor([[6.0]])], dim=1))
+
+
 def test_updates_see_normalized_observations(trained: PEARL, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[th.Tensor] = []
     critic = trained.critic.forward

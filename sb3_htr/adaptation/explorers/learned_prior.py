@@ -32,16 +32,13 @@ class LearnedPrior(FixedExploration, ParticleExplorer):
         is_train = self.particles.is_train
         self._prior = th.where(is_train, 0.0, -th.inf) if is_train.any() else self.particles.log_prior
         self.log_weights[:] = self._prior
-        self._draw(np.arange(len(self.z)))
+        self.draw(np.arange(len(self.z)))
 
     def observe(self, step: "Step") -> None:
         self.infer(step)
-        ended = np.flatnonzero(step.dones)
-        if len(ended):
-            self.adaptation.infer(ended, keep=True)
-            self._draw(ended)
+        super().observe(step)
 
-    def _draw(self, envs: np.ndarray) -> None:
+    def draw(self, envs: np.ndarray) -> None:
         exploring = th.as_tensor(self.exploring()[envs], device=self._prior.device)[:, None]
         weights = th.where(exploring, self._prior.softmax(dim=0), self.weights(envs))
         particle = th.multinomial(weights.cpu(), 1, generator=self.adaptation.generator)[:, 0]

@@ -1,5 +1,6 @@
 """PEARL's own protocol."""
 
+from abc import abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -29,6 +30,20 @@ class FixedExploration(Explorer):
     def exploring(self) -> np.ndarray:
         return np.asarray(self.adaptation.n_episodes < self.n_exploration_episodes)
 
+    def observe(self, step: "Step") -> None:
+        ended = np.flatnonzero(step.dones)
+        if len(ended):
+            self.adaptation.infer(ended, keep=True)
+            self.draw(ended)
+
+    @abstractmethod
+    def draw(self, envs: np.ndarray) -> None:
+        """
+        Choose z for the next episode.
+
+        :param envs: (k,) int, whose episodes have ended, and are in their posteriors
+        """
+
 
 @dataclass
 class Prior(FixedExploration):
@@ -40,17 +55,11 @@ class Prior(FixedExploration):
 
     def start(self) -> None:
         self.z = np.zeros((self.adaptation.n_envs, self.adaptation.policy.latent_dim), dtype=np.float32)
-        self._draw(np.arange(len(self.z)))
-
-    def observe(self, step: "Step") -> None:
-        ended = np.flatnonzero(step.dones)
-        if len(ended):
-            self.adaptation.infer(ended, keep=True)
-            self._draw(ended)
+        self.draw(np.arange(len(self.z)))
 
     def deviation(self) -> np.ndarray:
         return np.where(self.exploring()[:, None], 1.0, super().deviation())
 
-    def _draw(self, envs: np.ndarray) -> None:
+    def draw(self, envs: np.ndarray) -> None:
         explored, inferred = self.adaptation.noise(len(envs)), self.adaptation.sample_posterior(envs)
         self.z[envs] = np.where(self.exploring()[envs, None], explored, inferred)

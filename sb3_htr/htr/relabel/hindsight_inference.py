@@ -4,7 +4,6 @@ import numpy as np
 import torch as th
 
 from sb3_htr.common.checks import check_numbers
-from sb3_htr.common.type_aliases import Context
 from sb3_htr.htr.episode_store import evenly_spread
 from sb3_htr.htr.relabel.training_task import TrainingTaskRelabelling
 
@@ -52,7 +51,7 @@ class HindsightInference(TrainingTaskRelabelling):
 
     def _task_variables(self) -> th.Tensor:
         """(n_tasks, latent_dim), z of the training tasks: given what was relabelled to them last, or else their own replay."""
-        buffer, columns, tasks = self.buffer, self.buffer.transitions, np.arange(self.buffer.n_tasks)
+        buffer, tasks = self.buffer, np.arange(self.buffer.n_tasks)
         relabelled, own = (
             store.index().latest_episodes(tasks, buffer.context_episodes) for store in (self.episodes, buffer.episodes)
         )
@@ -61,5 +60,4 @@ class HindsightInference(TrainingTaskRelabelling):
         steps, lengths = evenly_spread(ranges[:, 1] - ranges[:, 0], self.context_size)
         virtual = steps + np.repeat(ranges[:, 0], lengths)
         rows = buffer.take(virtual, np.repeat(is_relabelled, lengths), self.episodes)
-        arrays = rows[:, columns.observation], rows[:, columns.action], rows[:, columns.reward], lengths
-        return self.policy.infer(Context(*(th.as_tensor(array, device=self.policy.device) for array in arrays)))[0]
+        return self.policy.infer(buffer.transitions.context(rows, lengths, self.policy.device))[0]

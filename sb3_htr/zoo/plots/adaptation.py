@@ -12,6 +12,9 @@ from sb3_htr.adaptation.evaluation import AdaptationRecord
 from sb3_htr.adaptation.first_success import first_success
 from sb3_htr.zoo.plots.style import BLUE, GREEN, GREY, ORANGE, save, span_unit_if_flat
 
+# Tasks in a picture of paths, evenly taken from all of them
+N_PATHS = 6
+
 
 def start_position(env: gym.Env) -> np.ndarray | None:
     """
@@ -64,7 +67,6 @@ def plot_adaptation_paths(
     start: np.ndarray | None,
     path: Path,
     title: str,
-    n_tasks: int = 6,
 ) -> None:
     """
     The ways of the adaptation episodes on the plane, for task spaces that are a plane.
@@ -75,9 +77,8 @@ def plot_adaptation_paths(
     :param start: of all episodes, see :func:`start_position`; paths begin after the first step if None
     :param path: picture to write
     :param title: what was adapted
-    :param n_tasks: number of tasks to show, evenly taken from all of them
     """
-    shown = np.unique(np.linspace(0, len(tasks) - 1, n_tasks).astype(int))
+    shown = np.unique(np.linspace(0, len(tasks) - 1, N_PATHS).astype(int))
     order = np.argsort(np.arctan2(tasks[:, 1], tasks[:, 0]))[shown]
     columns = min(3, len(order))
     rows = -(-len(order) // columns)

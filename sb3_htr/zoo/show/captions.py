@@ -14,12 +14,11 @@ LINE, MARGIN, COLUMN = 1.5, 0.7, 10.7
 class Captioner:
     """
     Adds a panel below each frame: task, episode, return, how well z is known, and a bar for the return of each episode.
-
-    :param top_return: return of a full bar; it grows if there is a larger one
     """
 
-    def __init__(self, top_return: float = 1.0) -> None:
-        self.top_return = top_return
+    def __init__(self) -> None:
+        # Return of a full bar; it grows if there is a larger one
+        self.top_return = 1.0
         # Of the first moment of each task: z can be known no worse than before the first episode
         self._deviation = 0.0
 
