@@ -5,6 +5,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 
+from sb3_htr.htr.groups import positions
+
 
 def evenly_spread(lengths: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     """
@@ -15,8 +17,7 @@ def evenly_spread(lengths: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarra
     :return: the steps taken, those of the first episode first, and (n,) int, how many are of each
     """
     taken = np.minimum(lengths, size)
-    position = np.arange(taken.sum()) - np.repeat(np.cumsum(taken) - taken, taken)
-    return ((2 * position + 1) * np.repeat(lengths, taken)) // (2 * np.repeat(taken, taken)), taken
+    return ((2 * positions(taken) + 1) * np.repeat(lengths, taken)) // (2 * np.repeat(taken, taken)), taken
 
 
 class EpisodeIndex(NamedTuple):
@@ -46,6 +47,13 @@ class EpisodeIndex(NamedTuple):
         """
         first, end = self.task_episode[tasks], self.task_episode[tasks + 1]
         return self.episode_row[np.stack([np.maximum(end - n_episodes, first), end], axis=1)]
+
+    def task_of(self, episodes: np.ndarray) -> np.ndarray:
+        """
+        :param episodes: (m,) int
+        :return: (m,) int, the task that each is of
+        """
+        return np.searchsorted(self.task_episode, episodes, side="right") - 1
 
     def all_episodes(self, tasks: np.ndarray) -> np.ndarray:
         """
@@ -192,9 +200,8 @@ class EpisodeStore:
             lengths = self._lengths[slots]
             task_episode = np.concatenate([[0], np.cumsum(count)])
             episode_row = np.concatenate([[0], np.cumsum(lengths)])
-            step = np.arange(episode_row[-1]) - np.repeat(episode_row[:-1], lengths)
             self._index = EpisodeIndex(
-                rows=np.repeat(slots * self.episode_length, lengths) + step,
+                rows=np.repeat(slots * self.episode_length, lengths) + positions(lengths),
                 episode_row=episode_row,
                 task_episode=task_episode,
                 task_row=episode_row[task_episode],

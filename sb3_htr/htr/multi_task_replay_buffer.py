@@ -15,6 +15,7 @@ from sb3_htr.common.settings import make
 from sb3_htr.common.task_reward import ROUNDING, task_reward
 from sb3_htr.common.type_aliases import MultiTaskSamples, RewardLabels, TaskFamily
 from sb3_htr.htr.episode_store import EpisodeStore
+from sb3_htr.htr.groups import first_rows, positions
 from sb3_htr.htr.n_step import n_step_returns, steps_ahead
 from sb3_htr.htr.relabel import RELABELLERS, Relabeller
 from sb3_htr.htr.reward_hook import check_reward_hook
@@ -40,7 +41,7 @@ def spread(rng: np.random.Generator, ranges: np.ndarray, width: int) -> tuple[np
     # As many random numbers for each range, so that what is drawn from one does not depend on the others
     uniform = rng.random((len(ranges), width))[np.arange(width) < size[:, None]]
     n = np.repeat(size, size)
-    part = np.arange(len(n)) - np.repeat(np.cumsum(size) - size, size)
+    part = positions(size)
     range_length = np.repeat(length, size)
     first = part * range_length // n
     end = (part + 1) * range_length // n
@@ -401,7 +402,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             lengths=self._tensor(n_batch),
             task_ids=tasks,
             relabelled=relabelled,
-            unrewarded=np.logical_and.reduceat(np.abs(beside) <= ROUNDING, np.cumsum(n_batch) - n_batch),
+            unrewarded=np.logical_and.reduceat(np.abs(beside) <= ROUNDING, first_rows(n_batch)),
             labels=self._label(first, context_rows, n_context, reward_task, n_labelled),
         )
 
@@ -439,7 +440,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         traj = columns.trajectory(rows[chosen])
         reward = task_reward(self.task_family.compute_reward(traj, tasks), traj.task_free_reward)
         rewarded = task_reward(context[:, columns.reward], context[:, columns.task_free_reward]) > 0
-        inferred = np.logical_or.reduceat(rewarded, np.cumsum(n_context) - n_context)
+        inferred = np.logical_or.reduceat(rewarded, first_rows(n_context))
         return RewardLabels(
             rows=self._tensor(chosen),
             next_observations=self._tensor(traj.next_observations),

@@ -6,6 +6,7 @@ import torch as th
 from sb3_htr.common.checks import check_numbers
 from sb3_htr.common.type_aliases import Context
 from sb3_htr.htr.episode_store import evenly_spread
+from sb3_htr.htr.groups import first_rows, positions
 from sb3_htr.htr.relabel.training_task import TrainingTaskRelabelling
 
 # Pairs of an episode and a task that networks look at together, to bound memory
@@ -33,7 +34,7 @@ class HindsightForesight(TrainingTaskRelabelling):
         self.n_starts = n_starts
 
     def utilities(self, rows: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-        first = np.cumsum(lengths) - lengths
+        first = first_rows(lengths)
         starts = rows[self.buffer.relabel_rng.choice(first, self.n_starts), self.buffer.transitions.observation]
         steps, taken = evenly_spread(lengths, self.context_size)
         rows = rows[steps + np.repeat(first, taken)]
@@ -50,8 +51,7 @@ class HindsightForesight(TrainingTaskRelabelling):
         rewards = family.compute_reward(columns.trajectory(rows), tasks)
         # Each episode once for each task
         repeated = np.repeat(lengths, n_tasks)
-        begin = np.repeat(np.cumsum(lengths) - lengths, n_tasks)
-        row = np.arange(repeated.sum()) - np.repeat(np.cumsum(repeated) - repeated - begin, repeated)
+        row = positions(repeated) + np.repeat(np.repeat(first_rows(lengths), n_tasks), repeated)
         task = np.repeat(np.tile(np.arange(n_tasks), n_episodes), repeated)
         arrays = rows[row, columns.observation], rows[row, columns.action], rewards[task, row], repeated
         mean, _ = policy.infer(Context(*(th.as_tensor(array, device=policy.device) for array in arrays)))

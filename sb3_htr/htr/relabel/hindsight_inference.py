@@ -5,6 +5,7 @@ import torch as th
 
 from sb3_htr.common.checks import check_numbers
 from sb3_htr.htr.episode_store import evenly_spread
+from sb3_htr.htr.groups import first_rows
 from sb3_htr.htr.relabel.training_task import TrainingTaskRelabelling
 
 LEVELS = ("episode", "transition")
@@ -40,7 +41,7 @@ class HindsightInference(TrainingTaskRelabelling):
         if self.level == "episode":
             family = self.buffer.task_family
             rewards = family.compute_reward(self.buffer.transitions.trajectory(rows), family.train_tasks)
-            return np.add.reduceat(rewards, np.cumsum(lengths) - lengths, axis=1, dtype=np.float64).T
+            return np.add.reduceat(rewards, first_rows(lengths), axis=1, dtype=np.float64).T
         z, columns = self._task_variables(), self.buffer.transitions
         n = max(CHUNK // len(z), 1)
         values = [

@@ -118,7 +118,7 @@ class SingleEpisodeRelabelling(Relabeller):
         episode = episode[chosen]
         batch = context = np.stack([index.episode_row[episode], index.episode_row[episode + 1]], axis=1)
         if self.rl_batch_source == "task":
-            batch = index.all_episodes(np.searchsorted(index.task_episode, episode, side="right") - 1)
+            batch = index.all_episodes(index.task_of(episode))
         if self.context_episodes > 1:
             context = self._window(episode)
         return HindsightDraw(buffer.episodes, context, batch, hindsight_task[chosen], False, self.elsewhere)
@@ -126,7 +126,7 @@ class SingleEpisodeRelabelling(Relabeller):
     def _window(self, episode: np.ndarray) -> np.ndarray:
         """(m, 2) int, virtual rows of the neighbouring episodes that contexts are drawn from."""
         rng, index = self.buffer.relabel_rng, self.buffer.episodes.index()
-        task = np.searchsorted(index.task_episode, episode, side="right") - 1
+        task = index.task_of(episode)
         n = rng.integers(1, self.context_episodes + 1, size=len(episode))
         first = episode - rng.integers(0, n + 1)
         end = np.minimum(first + n, index.task_episode[task + 1])

@@ -7,6 +7,7 @@ import numpy as np
 import torch as th
 
 from sb3_htr.common.checks import check_numbers
+from sb3_htr.htr.groups import positions
 from sb3_htr.htr.relabel.base import HindsightDraw
 from sb3_htr.htr.relabel.hindsight_buffers import HindsightBuffers
 
@@ -119,5 +120,5 @@ def _cut(count: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Numbers of transitions of each task to parts of at most so many: the task of each part and its length, (n,) int each."""
     n_parts = -(-count // size)
     task = np.repeat(np.arange(len(count)), n_parts)
-    part = np.arange(len(task)) - np.repeat(np.cumsum(n_parts) - n_parts, n_parts)
+    part = positions(n_parts)
     return task, np.minimum(count[task] - part * size, size)
