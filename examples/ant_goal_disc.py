@@ -1,7 +1,7 @@
 """A sparse family of the literature: the ant must find a goal anywhere in a disc around its start.
 
     python examples/ant_goal_disc.py                                       # meta-train and adapt
-    sb3-htr train --env AntGoalDisc-v0 --gym-packages examples.ant_goal_disc -params ent_coef:0.05
+    sb3-htr train --env AntGoalDisc-v0 --gym-packages examples.ant_goal_disc -n 600000 -params ent_coef:0.05
 
 Disc, goal radius, time limit and the six episodes of an adaptation are those of the sparse ant goal of HyperX (Zintgraf et
 al., 2021), which trains on it for 400 million env steps. The ant is that of SparseAnt-v0, with weak legs; theirs is

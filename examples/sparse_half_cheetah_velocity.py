@@ -1,7 +1,7 @@
 """A sparse family of the literature: gymnasium's half-cheetah is rewarded only near a speed that it is not told.
 
     python examples/sparse_half_cheetah_velocity.py                                # meta-train and adapt
-    sb3-htr train --env SparseHalfCheetahVelocity-v0 --gym-packages examples.sparse_half_cheetah_velocity
+    sb3-htr train --env SparseHalfCheetahVelocity-v0 --gym-packages examples.sparse_half_cheetah_velocity -n 1000000
 
 Tasks, reward and time limit are those on which HFR (Wan, Peng and Gangwani, 2022) was tested, in a million env steps. It
 differs in gymnasium's observation, to which the speed is added: a reward must follow from what is observed.

@@ -262,7 +262,7 @@ def check_rewards(env: VecEnv) -> None:
     if changed_by is not None:
         raise ValueError(
             f"The env is in {changed_by}, which changes its rewards, but relabelled rewards are those of its task family: "
-            "leave the wrapper away."
+            "leave the wrapper out."
         )
     if env.has_attr("reward_type") and env.get_attr("reward_type")[0] != "sparse":
         raise ValueError(
@@ -279,7 +279,7 @@ def check_is_not_normalized(env: VecEnv) -> None:
     """
     if unwrap_vec_normalize(env) is not None:
         raise ValueError(
-            "VecNormalize stands between the env and relabelled rewards, and is not saved with the model: leave it away, the "
+            "VecNormalize stands between the env and relabelled rewards, and is not saved with the model: leave it out, the "
             "policy normalizes observations itself. Rewards cannot be normalized: all tasks share one scale."
         )
 

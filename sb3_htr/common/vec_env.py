@@ -94,7 +94,7 @@ class BatchedTaskVecEnv(VecEnv):
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
         if len(list(self._get_indices(indices))) < self.num_envs:
             raise ValueError(
-                "One call serves the whole batch of envs, not some of them: leave indices away, or make the envs one by one, "
+                "One call serves the whole batch of envs, not some of them: leave indices out, or make the envs one by one, "
                 "with vec_env_class=DummyVecEnv."
             )
         return [getattr(self.vector_env, method_name)(*args, **kwargs)] * self.num_envs

@@ -78,7 +78,7 @@ class Ray(Executor):
             ray.init(address, log_to_driver=False)
         except (OSError, ValueError, RuntimeError) as error:
             raise ConnectionError(
-                f"No Ray cluster answers at {address} ({error}): start one with `ray start --head`, or leave --ray away."
+                f"No Ray cluster answers at {address} ({error}): start one with `ray start --head`, or leave --ray out."
             ) from None
         self._call = ray.remote(num_cpus=1, max_calls=1, max_retries=0)(_call)
 

@@ -128,7 +128,7 @@ class Rival(CheckedFiles, Resumable):
         :raises ValueError: for an explorer
         """
         if explorer not in (None, OwnWay.name):
-            raise ValueError(f"{type(self).__name__} has no explorers, but the explorer is {explorer!r}: leave it away.")
+            raise ValueError(f"{type(self).__name__} has no explorers, but the explorer is {explorer!r}: leave it out.")
         return self._adaptation(n_envs, generator)
 
     def check_env(self, env: VecEnv) -> None:

@@ -40,7 +40,7 @@ def test_a_batch_has_the_attributes_of_single_envs() -> None:
     env.reset()
     assert env.has_attr("task_id") and env.get_attr("task_id", 1) == [3] and not env.has_attr("no_such_attribute")
     assert env.has_attr("task") and len(env.get_attr("task")) == 2
-    with pytest.raises(ValueError, match="One call serves the whole batch of envs, not some of them: leave indices away"):
+    with pytest.raises(ValueError, match="One call serves the whole batch of envs, not some of them: leave indices out"):
         env.env_method("set_task", None, indices=[0])
 
 

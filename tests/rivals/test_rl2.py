@@ -133,7 +133,7 @@ def test_bad_settings_are_refused(settings: dict[str, Any], message: str) -> Non
 def test_it_has_no_explorers() -> None:
     model = tiny_rl2()
     assert model.start_adaptation(2, "own").exploring().all()
-    with pytest.raises(ValueError, match="RL2 has no explorers, but the explorer is 'prior': leave it away"):
+    with pytest.raises(ValueError, match="RL2 has no explorers, but the explorer is 'prior': leave it out"):
         model.start_adaptation(2, "prior")
 
 

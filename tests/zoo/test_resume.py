@@ -319,9 +319,9 @@ def test_a_full_disk_stops_no_training(tmp_path: Path, monkeypatch: pytest.Monke
 
 def test_changed_settings_and_extra_arguments_are_refused(unbroken: Path, tmp_path: Path) -> None:
     run = cut_off(unbroken, tmp_path)
-    with pytest.raises(ValueError, match=r"own arguments: leave --seed 5 away"):
+    with pytest.raises(ValueError, match=r"own arguments: leave --seed 5 out"):
         main(["train", "--resume", str(run), "--seed", "5"])
-    with pytest.raises(ValueError, match=r"own arguments: leave --method away"):
+    with pytest.raises(ValueError, match=r"own arguments: leave --method out"):
         main(["train", "--resume", str(run), "--method", "htr-ec"])
     record = json.loads((run / "run.json").read_text())
     record["hyperparams"]["gamma"] = 0.5

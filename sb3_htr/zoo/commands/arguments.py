@@ -102,7 +102,7 @@ def chosen_agent(parser: argparse.ArgumentParser, args: argparse.Namespace, path
         agent = agent_at(path, args.model, args.env)
         if args.env not in (None, agent.env_id):
             raise ValueError(
-                f"{agent.path} was trained on {agent.env_id}, but --env is {args.env}: leave one of the two away "
+                f"{agent.path} was trained on {agent.env_id}, but --env is {args.env}: leave one of the two out "
                 f"(-f FOLDER --env ID looks for agents of an env)."
             )
     elif args.env is not None:

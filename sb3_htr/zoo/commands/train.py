@@ -75,7 +75,7 @@ def main(argv: Sequence[str]) -> None:
         rest += env
         if rest or args.method:
             more_than_run = " ".join(rest) or "--method"
-            raise ValueError(f"train --resume goes on with the run's own arguments: leave {more_than_run} away.")
+            raise ValueError(f"train --resume goes on with the run's own arguments: leave {more_than_run} out.")
         run = find_run(args.resume)
         record = read_record(run / RECORD)
         if not {*OF_TRAINING} <= record.keys():

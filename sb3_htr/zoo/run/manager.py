@@ -137,7 +137,7 @@ class MetaExperimentManager(ExperimentManager):
     ) -> tuple[dict[str, Any], Callable[..., Any] | None, list[BaseCallback], Callable[..., Any] | None]:
         if "normalize" in hyperparams:
             raise ValueError(
-                "normalize asks for SB3's VecNormalize, which is not saved with the model: leave it away, the policy "
+                "normalize asks for SB3's VecNormalize, which is not saved with the model: leave it out, the policy "
                 "normalizes observations itself (normalize_observations of policy_kwargs)."
             )
         model_class = self.method.algorithm.model_class()
