@@ -2,6 +2,7 @@
 
 import os
 import re
+import warnings
 from typing import Any
 
 import torch as th
@@ -9,6 +10,8 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import LinearSchedule
 
+from sb3_htr.adaptation import explorers
+from sb3_htr.common.checks import keywords_of
 from sb3_htr.common.errors import last_line
 from sb3_htr.common.plain import Refused, read_model
 from sb3_htr.common.saving import with_suffix
@@ -95,7 +98,14 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
 
 
 def _plain(explorer: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in explorer.items() if key not in (TYPE, PICKLED)}
+    settings = {key: value for key, value in explorer.items() if key not in (TYPE, PICKLED)}
+    name = settings.get("name")
+    if not isinstance(name, str) or name not in explorers.EXPLORERS:
+        return settings
+    known = {"name", *keywords_of(explorers.EXPLORERS[name])}
+    if unknown := sorted(settings.keys() - known):
+        warnings.warn(f"Explorer {name!r} has no setting {unknown[0]!r} in this version: it is left out.", stacklevel=3)
+    return {key: value for key, value in settings.items() if key in known}
 
 
 def _schedule(learning_rate: Any) -> dict[str, LinearSchedule]:

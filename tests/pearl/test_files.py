@@ -95,6 +95,15 @@ def test_explorers_can_be_given_in_place_of_those_of_the_file(tiny_pearl: MakePE
     assert loaded.explorer == Prior() and loaded.train_explorer == Aggregate(scale=2.0)
 
 
+def test_settings_that_an_explorer_had_once_are_left_out(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    explorer = Belief(margin=2.0)
+    explorer.noise = 0.1  # type: ignore[attr-defined]
+    tiny_pearl(explorer=explorer).save(tmp_path / "older")
+    with pytest.warns(UserWarning, match="'belief' has no setting 'noise' in this version: it is left out"):
+        assert load_untrusted(tmp_path / "older", ENV_ID).explorer == Belief(margin=2.0)
+    assert PEARL.load(tmp_path / "older").explorer == Belief(margin=2.0)
+
+
 def test_an_untrusted_model_acts_as_the_one_that_was_saved(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
     explorers: dict[str, Any] = {"explorer": Belief(margin=2.0), "train_explorer": Prior(2)}
     replay = {"relabeller": {"name": "EpisodeClustering", "cell_size": 0.3}, "relabel_probability": 0.4}

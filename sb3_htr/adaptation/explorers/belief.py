@@ -17,11 +17,6 @@ if TYPE_CHECKING:
 N_COMPARED = 32
 # z is chosen anew about so often in an episode, once it is known how long one is
 N_CHOICES = 40
-# A value below says nothing about how far a task is
-MIN_VALUE = 1e-3
-# When an episode with one z keeps its word: of what was found, what it must return to end the search; of what the critics
-# promised at its start, what they must still promise as long as it is unrewarded. By measurement, docs/trials.md
-KEPT = 0.5
 
 
 @dataclass
@@ -38,13 +33,17 @@ class Belief(ParticleExplorer):
     whose value, as it goes on, is not what it was at the start, searches on to its end.
 
     :param margin: a particle must promise so many times what the best episode returned, to be tried in its place
+    :param kept: when an episode with one z keeps its word: of what was found, the share that it must return to end the search;
+        of what the critics promised at its start, the share that they must still promise as long as it is unrewarded. By
+        measurement, docs/trials.md
     """
 
     margin: float = 1.02
+    kept: float = 0.5
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_numbers(margin=(self.margin, 0.0, float("inf")))
+        check_numbers(margin=(self.margin, 0.0, float("inf")), kept=(self.kept, 0.0, 1.0))
 
     def start(self) -> None:
         super().start()
@@ -81,7 +80,7 @@ class Belief(ParticleExplorer):
         return np.where((self._best_z_return > 0)[:, None], self._best_z, self.z)
 
     def look(self, obs: np.ndarray) -> None:
-        unsure = (self._best_z_return <= KEPT * self._best_return) & ~self._has_proposal
+        unsure = (self._best_z_return <= self.kept * self._best_return) & ~self._has_proposal
         search = unsure & (self.exploring() | ~self._searching)
         self._searching = np.where(self._at_start, search, self._searching)
         due = self._at_start | (self._n_steps % self._every == 0)
@@ -109,7 +108,7 @@ class Belief(ParticleExplorer):
         gain, index = (self.weights(envs) @ self.particles.gain.T).topk(n_compared, dim=1)
         z = self.particles.z[index]
         beside = self.adaptation.policy.values(obs[envs], z) - self.adaptation.knowledge.task_free_value
-        promise = gain * beside.clamp(min=MIN_VALUE)
+        promise = gain * beside.clamp(min=0)
         return z[th.arange(len(envs)), promise.argmax(dim=1)]
 
     def _exploit(self, envs: np.ndarray, obs: np.ndarray) -> None:
@@ -138,7 +137,7 @@ class Belief(ParticleExplorer):
             return
         kept = self.adaptation.gamma ** self._n_steps[envs] * self._values(envs, obs)
         promised = self._promised[envs]
-        self._gave_up[envs] = (promised > MIN_VALUE) & (kept < KEPT * promised)
+        self._gave_up[envs] = (promised > 0) & (kept < self.kept * promised)
 
     def _values(self, envs: np.ndarray, obs: np.ndarray) -> np.ndarray:
         """(k,), of going on with z."""

@@ -1,5 +1,6 @@
 """Bayes' rule over particles."""
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
@@ -15,8 +16,6 @@ if TYPE_CHECKING:
 
 # Draws from the prior in place of particles, before meta-training has solved a task
 N_DRAWS = 32
-# Rewards that are further than so many deviations from what is expected say no more than these
-OUTLIER = 3.0
 
 
 @dataclass
@@ -27,25 +26,19 @@ class ParticleExplorer(Explorer):
 
     Nothing else is used than observations, actions and rewards.
 
-    :param doubt: probability of a success where the model excludes one, and of none where it is sure of one; above 0, so that
-        no reward is impossible. By measurement, docs/trials.md
+    :param doubt: smallest likelihood that the model is believed: of a success where it excludes one, of none where it is sure
+        of one, and of a reward beside the one expected. By measurement, docs/trials.md
     :param temperature: power of each step's likelihood: steps of an episode are not independent
-    :param noise: smallest standard deviation of rewards around those expected, relative to the mean reward of a success
     """
 
     needs_success: ClassVar[bool] = True
 
     doubt: float = 0.005
     temperature: float = 0.5
-    noise: float = 0.1
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_numbers(
-            doubt=(self.doubt, 1e-6, 0.5),
-            temperature=(self.temperature, 0.0, 1.0),
-            noise=(self.noise, 0.0, float("inf")),
-        )
+        check_numbers(doubt=(self.doubt, 1e-6, 0.5), temperature=(self.temperature, 0.0, 1.0))
 
     def start(self) -> None:
         adaptation = self.adaptation
@@ -94,8 +87,8 @@ class ParticleExplorer(Explorer):
             chance = model.success_logits(states, self._tasks).sigmoid().clamp(self.doubt, 1 - self.doubt)
             log_likelihood = th.where(rewarded[:, None], chance, 1 - chance).log()
             if rewarded.any():
-                deviation = th.maximum(model.deviation, self.noise * model.scale)
-                error = (reward[:, None] - model.success_rewards(states, self._tasks)) / deviation
-                surprise = 0.5 * error.clamp(-OUTLIER, OUTLIER).square()
-                log_likelihood = log_likelihood - th.where(rewarded[:, None], surprise, 0.0)
+                error = (reward[:, None] - model.success_rewards(states, self._tasks)) / model.deviation.clamp(min=1e-6)
+                # Relative to that of the reward expected
+                log_density = (-0.5 * error.square()).clamp(min=math.log(self.doubt))
+                log_likelihood = log_likelihood + th.where(rewarded[:, None], log_density, 0.0)
         self.log_weights += self.temperature * log_likelihood
