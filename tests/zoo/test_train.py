@@ -87,13 +87,16 @@ def test_normalized_runs_are_evaluated_as_they_were_trained(tmp_path: Path) -> N
     np.testing.assert_allclose(np.load(run / "adaptation.npz")["returns"], during, atol=1e-4)
 
 
-def test_env_kwargs_of_the_yaml_reach_the_evaluation(tmp_path: Path) -> None:
+def test_env_kwargs_of_the_yaml_reach_the_evaluation(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A zoo trap: rl_zoo3 gives them to the training env only."""
     block = {**{k: v for k, v in TINY.items() if k != "seed"}, "policy": "MlpPolicy", "n_timesteps": 240, "n_envs": 4}
     file = tmp_path / "my.yml"
     file.write_text(yaml.safe_dump({ENV_ID: {**block, "env_kwargs": {"goal_distance": 0.05}}}))
     arguments = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(file), "--eval-freq", "240", "--verbose", "0"]
     assert main(arguments) == 0
+    assert "240 env steps, that of `learn()` for episodes of 20 steps 150,000: -n 150000 takes it" in capsys.readouterr().out
+    assert main([*arguments, "-n", "240"]) == 0
+    assert "`learn()`" not in capsys.readouterr().out, "nobody asked"
     # Every goal disc of this distance holds the start, so that all adaptations find it at once
     evaluations = np.load(run_folder(tmp_path) / "evaluations.npz")
     assert evaluations["successes"].all(axis=(0, 1))[0]

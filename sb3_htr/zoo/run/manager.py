@@ -40,6 +40,7 @@ from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
 from sb3_htr.common.versions import differences, made_by
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.pearl.divergence import DivergedError
+from sb3_htr.pearl.horizon import timesteps_for
 from sb3_htr.pearl.pearl import PEARL
 from sb3_htr.pearl.policies import PEARLPolicy
 from sb3_htr.pearl.untrusted import load_untrusted
@@ -230,6 +231,14 @@ class MetaExperimentManager(ExperimentManager):
         :param model: as set up
         """
         done = 0
+        if isinstance(model, PEARL) and model.max_episode_steps is not None and self.args.n_timesteps == -1:
+            # The block `default` has the budget of short episodes
+            usual = timesteps_for(model.max_episode_steps)
+            if self.n_timesteps < usual:
+                print(
+                    f"The budget of {self.config} is {self.n_timesteps:,} env steps, that of `learn()` for episodes of "
+                    f"{model.max_episode_steps} steps {usual:,}: -n {usual} takes it."
+                )
         if self.resumed is not None:
             assert self._checkpointing is not None, "a run that has a checkpoint makes them"
             self._checkpointing.restore(cast(Any, model), self._checkpoint)
