@@ -13,7 +13,7 @@ from helpers import ENV_ID, many
 from helpers.experience import make_buffer
 from htr_envs import PointRobotFamily, TargetSpeedFamily
 from sb3_htr.adaptation.explorers import EXPLORERS, to_explorer
-from sb3_htr.common.checks import keywords_of
+from sb3_htr.common.settings import keywords_of
 from sb3_htr.htr.relabel import RELABELLERS
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run.method import merged

@@ -13,7 +13,8 @@ from sb3_htr.adaptation.evaluation import MetaLearner, record_adaptation, task_s
 from sb3_htr.adaptation.explorers import to_explorer
 from sb3_htr.adaptation.first_success import first_success
 from sb3_htr.common.atomic import WRITE_ERRORS, atomic_path, reason
-from sb3_htr.common.checks import check_numbers, get_task_family
+from sb3_htr.common.checks import get_task_family
+from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
 
 

@@ -11,13 +11,9 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.loop import Adapts, Watched, adaptation_steps
-from sb3_htr.common.checks import (
-    check_is_env,
-    check_numbers,
-    get_max_episode_steps,
-    get_task_family,
-)
+from sb3_htr.common.checks import check_is_env, get_max_episode_steps, get_task_family
 from sb3_htr.common.random_state import seeded_actions
+from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.type_aliases import TaskFamily
 from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env, reset_to_tasks
 

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.common.checks import check_keywords, keywords_of
+from sb3_htr.common.settings import check_keywords, keywords_of
 
 SelfCheckedFiles = TypeVar("SelfCheckedFiles", bound="CheckedFiles")
 

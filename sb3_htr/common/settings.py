@@ -1,11 +1,14 @@
-"""Objects that a user chooses by a name, by a name with settings (as YAML files do), or brings along."""
+"""Settings that a user gives: numbers and keywords that are checked, and objects chosen by a name or brought along."""
 
-from collections.abc import Callable, Mapping
+import difflib
+import inspect
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar, cast
 
-from sb3_htr.common.checks import check_keywords
+import numpy as np
 
 Kind = TypeVar("Kind")
+VARIADIC = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
 
 
 def make(setting: str, value: Any, kinds: Mapping[str, Callable[..., Kind]], base: Any) -> Kind:
@@ -29,3 +32,63 @@ def make(setting: str, value: Any, kinds: Mapping[str, Callable[..., Kind]], bas
     settings = {key: item for key, item in given.items() if key != "name"}
     check_keywords(f"{setting} {name!r}", settings, kinds[name])
     return kinds[name](**settings)
+
+
+def check_numbers(**numbers: tuple[Any, float, float]) -> None:
+    """
+    :param numbers: name of a setting, its value, and the smallest and largest value that it may have; with an int as the
+        smallest one, it must be a whole number
+    :raises ValueError: for the first one that is none, or out of its range
+    """
+    for name, (value, low, high) in numbers.items():
+        whole = isinstance(low, int)
+        kind = int | np.integer if whole else int | float | np.number
+        # written so that nan, which compares with nothing, is refused too
+        if isinstance(value, bool) or not (isinstance(value, kind) and low <= value <= high):
+            article = "a whole number" if whole else "a number"
+            limits = f"of at least {low:g}" if high == float("inf") else f"from {low:g} to {high:g}"
+            raise ValueError(f"{name} is {value!r}, expected {article} {limits}.")
+
+
+def check_flags(**flags: Any) -> None:
+    """
+    :param flags: name of a setting and its value
+    :raises ValueError: for the first one that is neither True nor False, as a word in a YAML file is
+    """
+    for name, value in flags.items():
+        if not isinstance(value, bool):
+            raise ValueError(f"{name} is {value!r}, expected True or False.")
+
+
+def keywords_of(function: Callable[..., Any]) -> set[str]:
+    """
+    :param function: or a class
+    :return: names of the arguments that it takes
+    """
+    known: set[str] = set()
+    for part in getattr(function, "__mro__", (function,)):
+        own = vars(part).get("__init__") if isinstance(part, type) else part
+        if own is None:
+            continue
+        # A class that hands its keywords on has those of its parent too
+        parameters = inspect.signature(own).parameters
+        known |= {name for name, parameter in parameters.items() if parameter.kind not in VARIADIC}
+        if not any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in parameters.values()):
+            break
+    return known - {"self"}
+
+
+def check_keywords(owner: str, given: Iterable[str], function: Callable[..., Any], also: Iterable[str] = ()) -> None:
+    """
+    :param owner: whose keywords they are, for the message
+    :param given: names that a user gave
+    :param function: that takes them, or a class
+    :param also: names that are known elsewhere
+    :raises ValueError: for the first name that is not known, with the one most like it
+    """
+    known = keywords_of(function) | set(also)
+    for name in given:
+        if name not in known:
+            nearest = difflib.get_close_matches(name, known, n=1)
+            advice = f"did you mean {nearest[0]}?" if nearest else f"expected one of {sorted(known)}."
+            raise ValueError(f"{owner} has no setting {name!r}: {advice}")

@@ -18,7 +18,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from sb3_htr.common.atomic import reason
-from sb3_htr.common.checks import check_has_task_family, check_numbers, check_tasks, missing_hook
+from sb3_htr.common.checks import check_has_task_family, check_tasks, missing_hook
+from sb3_htr.common.settings import check_numbers
 
 # Side by side, where nobody says how many
 N_ENVS = 20

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from sb3_htr.common.checks import check_numbers
+from sb3_htr.common.settings import check_numbers
 
 # Env steps on each training task of a rollout, as far as from 2 to 10 episodes can have as many
 STEPS_PER_TASK = 400

@@ -34,6 +34,7 @@ from sb3_htr.common.latent_policy import Obs, State
 from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.random_state import get_generator_state, seeded_actions, set_generator_state
 from sb3_htr.common.saving import CheckedFiles, with_suffix
+from sb3_htr.common.settings import check_keywords, check_numbers
 from sb3_htr.common.training_state import Resumable
 from sb3_htr.common.vec_env import in_float32, make_task_vec_env
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
@@ -98,10 +99,10 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         **kwargs: Any,
     ) -> None:
         checks.check_device(kwargs.get("device", "auto"))
-        checks.check_numbers(n_tasks_per_rollout=(n_tasks_per_rollout, 1, float("inf")))
+        check_numbers(n_tasks_per_rollout=(n_tasks_per_rollout, 1, float("inf")))
         self.explorer, self.train_explorer = to_explorer(explorer), to_explorer(train_explorer)
         buffer_class = replay_buffer_class or MultiTaskReplayBuffer
-        checks.check_keywords("replay_buffer_kwargs", replay_buffer_kwargs or {}, buffer_class)
+        check_keywords("replay_buffer_kwargs", replay_buffer_kwargs or {}, buffer_class)
         if isinstance(env, str):
             env = make_task_vec_env(env, n_tasks_per_rollout, seed=seed)
         if env is not None:
@@ -123,7 +124,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         )
         # SAC adds an argument for state-dependent exploration, which is not for us: z explores
         self.policy_kwargs.pop("use_sde")
-        checks.check_keywords("policy_kwargs", self.policy_kwargs, self.policy_class)
+        check_keywords("policy_kwargs", self.policy_kwargs, self.policy_class)
         self.context_size: int = context_size  # type: ignore[assignment]
         self.n_steps: int = n_steps  # type: ignore[assignment]
         self.n_tasks_per_rollout = n_tasks_per_rollout
@@ -158,7 +159,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
     def _complete_settings(self) -> None:
         # Without an env, which is for files alone, the settings come from there
         max_episode_steps = 1
-        checks.check_numbers(n_tasks_per_rollout=(self.n_tasks_per_rollout, 1, float("inf")))
+        check_numbers(n_tasks_per_rollout=(self.n_tasks_per_rollout, 1, float("inf")))
         if self.env is not None:
             max_episode_steps, n_envs = checks.get_max_episode_steps(self.env), self.env.num_envs
             # All envs are stepped, as often as it takes
@@ -437,7 +438,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         """
         chosen = self.explorer if explorer in (None, self.explorer.name) else to_explorer(explorer)
         self._check_explorer(chosen)
-        checks.check_numbers(n_envs=(n_envs, 1, float("inf")))
+        check_numbers(n_envs=(n_envs, 1, float("inf")))
         return Adaptation(
             self.policy,
             self.knowledge,
@@ -475,7 +476,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
             env does not say so (``info["is_success"]``), whether a reward was told from what is task-free
         :raises ValueError: for several envs, an env with other spaces, a task that the env does not have, episodes without end
         """
-        checks.check_numbers(n_episodes=(n_episodes, 1, float("inf")))
+        check_numbers(n_episodes=(n_episodes, 1, float("inf")))
         vec_env = self._wrap_env(make_task_vec_env(env) if isinstance(env, str) else env, monitor_wrapper=False)
         if vec_env.num_envs != 1:
             raise ValueError(f"adapt() adapts to one task, but the VecEnv has {vec_env.num_envs} envs: pass a single env.")

@@ -8,8 +8,8 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_htr.adaptation.explorers import Explorer
-from sb3_htr.common.checks import check_numbers
 from sb3_htr.common.matmul import PRECISIONS, matmul_precision
+from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.type_aliases import RewardLabels
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.pearl.divergence import PosteriorWatch, check_finite

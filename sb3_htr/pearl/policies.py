@@ -13,10 +13,10 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, SACPolicy
 from torch import nn
 
-from sb3_htr.common.checks import check_numbers
 from sb3_htr.common.latent_policy import LatentPolicy
 from sb3_htr.common.linear import Linear, Stack, with_fast_layers
 from sb3_htr.common.normalizer import ObservationNormalizer
+from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.type_aliases import Context
 from sb3_htr.pearl.encoder import ContextEncoder, to_encoder_class
 from sb3_htr.pearl.reward_model import RewardModel

@@ -11,10 +11,10 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_htr.adaptation import explorers
-from sb3_htr.common.checks import keywords_of
 from sb3_htr.common.errors import last_line
 from sb3_htr.common.plain import Refused, read_model
 from sb3_htr.common.saving import with_suffix
+from sb3_htr.common.settings import keywords_of
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.pearl.encoder import ENCODERS
 from sb3_htr.pearl.pearl import PEARL

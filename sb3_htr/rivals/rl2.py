@@ -12,7 +12,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.adaptation import Step
 from sb3_htr.adaptation.loop import Watched
-from sb3_htr.common.checks import check_is_env, check_numbers
+from sb3_htr.common.checks import check_is_env
+from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.vec_env import N_ENVS, in_float32, make_task_vec_env
 from sb3_htr.rivals.base import Rival, RivalAdaptation
 from sb3_htr.rivals.trial_policy import TrialLstmPolicy

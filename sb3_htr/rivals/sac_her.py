@@ -16,14 +16,8 @@ from stable_baselines3.sac import SAC
 from stable_baselines3.sac.policies import MultiInputPolicy, SACPolicy
 
 from sb3_htr.adaptation.loop import Watched
-from sb3_htr.common.checks import (
-    check_is_env,
-    check_numbers,
-    check_same_family,
-    family_facts,
-    get_max_episode_steps,
-    get_task_family,
-)
+from sb3_htr.common.checks import check_is_env, check_same_family, family_facts, get_max_episode_steps, get_task_family
+from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.type_aliases import Trajectory
 from sb3_htr.common.vec_env import N_ENVS, in_float32, make_task_vec_env
 from sb3_htr.rivals.base import Rival, ToldAdaptation, unscaled

@@ -7,7 +7,8 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_htr.common.checks import check_numbers, check_spaces, get_max_episode_steps, get_task_family
+from sb3_htr.common.checks import check_spaces, get_max_episode_steps, get_task_family
+from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.vec_env import set_tasks
 from sb3_htr.rivals.base import scaled
 

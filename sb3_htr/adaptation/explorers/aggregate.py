@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from sb3_htr.adaptation.explorers.base import Explorer
-from sb3_htr.common.checks import check_numbers
+from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.task_reward import ROUNDING
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ import numpy as np
 import torch as th
 
 from sb3_htr.adaptation.explorers.particles import ParticleExplorer
-from sb3_htr.common.checks import check_numbers
+from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.task_reward import ROUNDING
 
 if TYPE_CHECKING:

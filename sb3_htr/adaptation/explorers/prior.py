@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sb3_htr.adaptation.explorers.base import Explorer
-from sb3_htr.common.checks import check_numbers
+from sb3_htr.common.settings import check_numbers
 
 if TYPE_CHECKING:
     from sb3_htr.adaptation.adaptation import Step

@@ -5,7 +5,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch as th
 
-from sb3_htr.common.checks import check_flags
+from sb3_htr.common.settings import check_flags
 from sb3_htr.common.type_aliases import Trajectory
 from sb3_htr.htr.relabel.base import HindsightDraw
 from sb3_htr.htr.relabel.hindsight_buffers import HindsightBuffers

@@ -3,7 +3,7 @@
 import numpy as np
 import torch as th
 
-from sb3_htr.common.checks import check_numbers
+from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.type_aliases import Context
 from sb3_htr.htr.episode_store import evenly_spread
 from sb3_htr.htr.groups import first_rows, positions

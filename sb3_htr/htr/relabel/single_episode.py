@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sb3_htr.common.checks import check_flags, check_numbers
+from sb3_htr.common.settings import check_flags, check_numbers
 from sb3_htr.common.type_aliases import Trajectory
 from sb3_htr.htr.relabel.base import HindsightDraw, Relabeller
 from sb3_htr.htr.relabel.hindsight_task import HindsightTaskStrategy, solved_at_start

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_htr.common.checks import check_numbers
+from sb3_htr.common.settings import check_numbers
 from sb3_htr.htr.groups import positions
 from sb3_htr.htr.relabel.base import HindsightDraw
 from sb3_htr.htr.relabel.hindsight_buffers import HindsightBuffers

@@ -5,7 +5,8 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from sb3_htr.adaptation.evaluation import task_set
-from sb3_htr.common.checks import check_numbers, get_task_family
+from sb3_htr.common.checks import get_task_family
+from sb3_htr.common.settings import check_numbers
 from sb3_htr.zoo.commands.arguments import add_adaptation_arguments, add_agent_arguments, make_parser, parse
 from sb3_htr.zoo.run.agents import TrainedAgent
 from sb3_htr.zoo.show.play import Moment, Player, heading, line, summary

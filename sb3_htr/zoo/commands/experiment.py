@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from sb3_htr.common.checks import check_numbers
+from sb3_htr.common.settings import check_numbers
 from sb3_htr.zoo.commands.arguments import OF_PACKAGES, make_parser
 from sb3_htr.zoo.run.trust import import_packages
 

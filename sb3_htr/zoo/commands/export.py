@@ -12,7 +12,8 @@ from stable_baselines3 import SAC
 
 from sb3_htr.adaptation.evaluation import record_adaptation
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.common.checks import get_task_family, keywords_of
+from sb3_htr.common.checks import get_task_family
+from sb3_htr.common.settings import keywords_of
 from sb3_htr.common.vec_env import N_ENVS
 from sb3_htr.zoo.commands.arguments import add_agent_arguments, make_parser, parse
 from sb3_htr.zoo.run.agents import RECORD, TrainedAgent

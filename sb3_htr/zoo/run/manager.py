@@ -33,9 +33,9 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
 from sb3_htr.common.atomic import WRITE_ERRORS, atomic_path, reason
-from sb3_htr.common.checks import check_keywords, check_numbers, keywords_of
 from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.resume import CheckpointCallback, checkpoints, cut_monitor_files, load_latest
+from sb3_htr.common.settings import check_keywords, check_numbers, keywords_of
 from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
 from sb3_htr.common.versions import differences, made_by
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer

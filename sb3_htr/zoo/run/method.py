@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 from sb3_htr.adaptation.explorers import EXPLORERS
-from sb3_htr.common.checks import keywords_of
+from sb3_htr.common.settings import keywords_of
 from sb3_htr.htr.relabel import RELABELLERS
 from sb3_htr.rivals.base import OwnWay
 from sb3_htr.zoo.run.algorithm import ALGORITHMS, Algorithm
