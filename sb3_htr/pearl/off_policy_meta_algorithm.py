@@ -170,7 +170,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
             rollout = self.n_tasks_per_rollout * self.n_episodes_per_task * max_episode_steps
             if rollout > MAX_STEPS_PER_UPDATE * self.gradient_steps:
                 warnings.warn(
-                    f"gradient_steps is {self.gradient_steps}, the updates after a rollout of {rollout} env steps. Left away, "
+                    f"gradient_steps is {self.gradient_steps}, the updates after a rollout of {rollout} env steps. Left out, "
                     f"they are one for every {STEPS_PER_UPDATE}."
                 )
 
