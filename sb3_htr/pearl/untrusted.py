@@ -76,7 +76,7 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
                 raise Refused(f"PEARL has no {name} of {settings[name]} here: expected {most} at most.")
         counters = {name: data[name] for name in COUNTERS if type(data.get(name)) is int}
         settings["policy_kwargs"] = _policy_kwargs(data.get("policy_kwargs", {}))
-    except FileNotFoundError:
+    except (FileNotFoundError, Warning):
         raise
     except Exception as error:  # whatever a stranger can put into a file
         why = f": {error}" if isinstance(error, Refused) else "."
@@ -104,7 +104,7 @@ def _plain(explorer: dict[str, Any]) -> dict[str, Any]:
         return settings
     known = {"name", *keywords_of(explorers.EXPLORERS[name])}
     if unknown := sorted(settings.keys() - known):
-        warnings.warn(f"Explorer {name!r} has no setting {unknown[0]!r} in this version: it is left out.", stacklevel=3)
+        warnings.warn(f"Explorer {name!r} has no setting {unknown[0]!r:.60} in this version: it is left out.", stacklevel=3)
     return {key: value for key, value in settings.items() if key in known}
 
 

@@ -101,6 +101,9 @@ def test_settings_that_an_explorer_had_once_are_left_out(tiny_pearl: MakePEARL, 
     tiny_pearl(explorer=explorer).save(tmp_path / "older")
     with pytest.warns(UserWarning, match="'belief' has no setting 'noise' in this version: it is left out"):
         assert load_untrusted(tmp_path / "older", ENV_ID).explorer == Belief(margin=2.0)
+    with warnings.catch_warnings(), pytest.raises(UserWarning, match="no setting 'noise'"):
+        warnings.simplefilter("error")  # and is not taken for damage
+        load_untrusted(tmp_path / "older", ENV_ID)
     assert PEARL.load(tmp_path / "older").explorer == Belief(margin=2.0)
 
 
