@@ -164,10 +164,9 @@ class CheckpointCallback(BaseCallback):
                 writer = type(output.writer)(log_dir=folder, purge_step=self.num_timesteps + 1)
                 output.writer.close()
                 output.writer = writer
-            if "elapsed_ns" in self._pending:  # which older versions have not saved
-                # What is logged goes on, too
-                self.model.start_time -= self._pending["elapsed_ns"]
-                self.model._num_timesteps_at_start = self._pending["num_timesteps_at_start"]
+            # What is logged goes on, too
+            self.model.start_time -= self._pending["elapsed_ns"]
+            self.model._num_timesteps_at_start = self._pending["num_timesteps_at_start"]
             self._pending = None
             return
         beyond = [folder for folder in checkpoints(self.run) if _n_steps(folder) > self.num_timesteps]

@@ -65,8 +65,7 @@ class Resumable(BaseAlgorithm):
     def _set_random_state(self, state: dict[str, Any]) -> None:
         assert self.env is not None
         set_global_state(state["global"])
-        if "actions" in state:  # which older versions have not saved
-            set_generator_state(self.action_space.np_random, state["actions"])
+        set_generator_state(self.action_space.np_random, state["actions"])
         for i, (generator, saved) in enumerate(zip(self.env.get_attr("np_random"), state["envs"], strict=True)):
             set_generator_state(generator, saved)
             self.env.set_attr("np_random", generator, indices=i)

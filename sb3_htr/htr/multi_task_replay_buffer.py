@@ -315,13 +315,12 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         :raises ValueError: if it is of another task family, or of a store of other sizes
         """
         check_same_family(state["task_family"], family_facts(self.task_family), "This model's env")
-        own = self._relabelled_by
-        if own and (by := state.get("relabelled_by", own)) != own:
+        own, by = self._relabelled_by, state["relabelled_by"]
+        if own and by != own:
             raise ValueError(
                 f"{own} keeps what it has relabelled, and what was saved is of {by or 'a relabeller that does not'}: make the "
                 "model with the relabeller that it was saved with."
             )
-        # First, as what older versions saved may be another relabeller's
         self.relabeller.load_state_dict(state["relabeller"])
         self.episodes.load_state_dict(state["episodes"])
         for generator, saved in zip((self._rng, self.relabel_rng), state["random"], strict=True):

@@ -494,8 +494,8 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         adaptation = self.start_adaptation(1, explorer, th.Generator().manual_seed(seed))
         returns, successes = np.zeros(n_episodes), np.zeros(n_episodes, dtype=bool)
         act = partial(adaptation.act, deterministic=deterministic)
-        # None in files of older versions
-        longest = np.inf if self.max_episode_steps is None else ENDLESS * self.max_episode_steps
+        assert self.max_episode_steps is not None  # as there is a policy, there was an env
+        longest = ENDLESS * self.max_episode_steps
         length = 0
         obs = np.asarray(vec_env.reset())
         if task is not None and np.ndim(task) > 0:

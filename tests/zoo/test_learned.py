@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_htr.zoo.run.learned import seconds_at, time_to_learned
+from sb3_htr.zoo.run.learned import time_to_learned
 
 N_TASKS, N_EPISODES = 3, 2
 
@@ -34,13 +34,6 @@ def test_solved_is_95_percent_of_the_way_to_the_last_evaluation(tmp_path: Path, 
 def test_seconds_are_those_of_the_log_between_rollouts(tmp_path: Path) -> None:
     log = "time/total_timesteps,eval/mean_reward,time/time_elapsed\n0,,0\n1000,3.5,\n4000,,8\n"
     assert time_to_learned(write_run(tmp_path, [0, 0, 10], log)) == (3000, 6.0)
-
-
-def test_a_run_that_went_on_took_as_long_as_both_parts(tmp_path: Path) -> None:
-    log = "time/total_timesteps,time/time_elapsed\n1000,2\n2000,4\n3000,6\n2000,1\n3000,3\n5000,7\n"
-    (tmp_path / "progress.csv").write_text(log)
-    seconds = seconds_at(tmp_path / "progress.csv", np.array([1000, 4000, 5000]))
-    np.testing.assert_allclose(seconds, [2, 6 + 5, 6 + 7])
 
 
 def test_a_run_without_evaluations_says_nothing(tmp_path: Path) -> None:

@@ -32,8 +32,7 @@ def seconds_at(log: Path, steps: np.ndarray) -> np.ndarray:
     :param log: ``progress.csv`` of a training
     :param steps: (n,) env steps
     :return: (n,) seconds of training until then, between the rollouts that were logged around it; what was trained after a
-        checkpoint and lost does not count. In logs of older versions, a training that went on counts from 0 again, which is
-        put right where it can be seen. NaN where nothing tells them
+        checkpoint and lost does not count. NaN where nothing tells them
     """
     if not log.exists():
         return np.full(len(steps), np.nan)
@@ -42,8 +41,4 @@ def seconds_at(log: Path, steps: np.ndarray) -> np.ndarray:
     logged = np.array([(float(step), float(second)) for step, second in rows if step and second])
     if len(logged) == 0:
         return np.full(len(steps), np.nan)
-    seconds = logged[:, 1]
-    again = np.append(False, np.diff(seconds) < 0)
-    before = np.cumsum(np.where(again, np.append(0.0, seconds[:-1]), 0.0))
-    # Where logs of older versions have rollouts twice, both count
-    return np.asarray(np.interp(steps, np.maximum.accumulate(logged[:, 0]), seconds + before))
+    return np.asarray(np.interp(steps, *logged.T))
