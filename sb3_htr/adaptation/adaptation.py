@@ -77,6 +77,8 @@ class Adaptation:
         self.task_reward = np.zeros(n_envs, dtype=np.float64)
         self.episode_return = np.zeros(n_envs, dtype=np.float64)
         self.best_return = np.zeros(n_envs, dtype=np.float64)
+        # What the most rewarded step returned beside what it would without success, whether that was taken for one or not
+        self.largest_reward = np.zeros(n_envs, dtype=np.float64)
         # Of the running episodes: observations, actions, rewards
         self._running: list[np.ndarray] = []
         self._n_steps = np.zeros(n_envs, dtype=np.int64)
@@ -162,6 +164,7 @@ class Adaptation:
             )
             task_free = policy.reward_model.task_free(policy.normalize(obs), action, policy.normalize(next_obs))
         beside = step.rewards - task_free.cpu().numpy()
+        self.largest_reward = np.maximum(self.largest_reward, beside)
         if self._watch is not None:
             self._watch.check(beside, np.asarray(step.dones))
         return np.where(beside > self.knowledge.threshold.item(), beside, 0.0)
