@@ -108,6 +108,7 @@ def test_float64_observations_teach_what_float32_does(tmp_path: Path) -> None:
         agents.append(model.adapt(env, n_episodes=3, task=0, explorer="prior"))
         models.append(model)
     single, double = models
+    assert type(copy.deepcopy(double).env) is type(double.env), "a copy rounds, too"
     assert single.observation_space == double.observation_space
     for name, value in parameters(single).items():
         th.testing.assert_close(parameters(double)[name], value, rtol=0, atol=0, msg=name)

@@ -161,7 +161,7 @@ def test_a_dead_env_process_is_named_and_hangs_nothing(tiny_pearl: MakePEARL) ->
 
     env = SubprocVecEnv([make, make], start_method="fork")
     with pytest.raises(
-        RuntimeError, match=r"process of an env died at env step \d+, on one of the training tasks \[\d+, \d+\]"
+        RuntimeError, match=r"At env step \d+, on one of the training tasks \[\d+, \d+\], the process of an env died"
     ):
         tiny_pearl(env).learn(ROLLOUT)
 

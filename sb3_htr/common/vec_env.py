@@ -150,8 +150,19 @@ class PatientResultsWriter(ResultsWriter):
             super().close()
 
 
-class TaskVecMonitor(VecMonitor):
-    """SB3's monitor, of which a deep copy can be made; the copy writes no file."""
+class CopiedWrapper(VecEnvWrapper):
+    """A wrapper of which a deep copy can be made. SB3's have none: whoever asks for it is passed on to the env within."""
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "CopiedWrapper":
+        result = memo[id(self)] = type(self).__new__(type(self))
+        # Two monitors would write into one file
+        shared = {"class_attributes": self.class_attributes, "results_writer": None}
+        vars(result).update({key: shared[key] if key in shared else copy.deepcopy(x, memo) for key, x in vars(self).items()})
+        return result
+
+
+class TaskVecMonitor(CopiedWrapper, VecMonitor):
+    """SB3's monitor. A deep copy writes no file."""
 
     def step_wait(self) -> VecEnvStepReturn:
         try:
@@ -163,15 +174,8 @@ class TaskVecMonitor(VecMonitor):
                 f"The env's step returns no info[{missing}], though its task family tells successes: add it to the info."
             ) from None
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> "TaskVecMonitor":
-        shared: dict[str, Any] = {"class_attributes": self.class_attributes, "results_writer": None}
-        result = memo[id(self)] = type(self).__new__(type(self))
-        vars(result).update({key: copy.deepcopy(value, memo) for key, value in vars(self).items() if key not in shared})
-        vars(result).update(shared)
-        return result
 
-
-class Float32VecEnv(VecEnvWrapper):
+class Float32VecEnv(CopiedWrapper):
     """
     Rounds observations to float32, in which all networks see them and the replay buffer keeps them.
 

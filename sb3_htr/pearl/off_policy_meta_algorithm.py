@@ -158,16 +158,16 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
 
     def _complete_settings(self) -> None:
         # Without an env, which is for files alone, the settings come from there
-        max_episode_steps = 1
+        max_episode_steps = n_envs = 1
         check_numbers(n_tasks_per_rollout=(self.n_tasks_per_rollout, 1, float("inf")))
         if self.env is not None:
             max_episode_steps, n_envs = checks.get_max_episode_steps(self.env), self.env.num_envs
-            # All envs are stepped, as often as it takes
-            self.n_tasks_per_rollout = -(-self.n_tasks_per_rollout // n_envs) * n_envs
+        # All envs are stepped, as often as it takes
+        n_tasks = -(-self.n_tasks_per_rollout // n_envs) * n_envs
         given = {name: getattr(self, name) for name in BY_HORIZON}
-        vars(self).update(complete(given, max_episode_steps, self.n_tasks_per_rollout))
+        vars(self).update(complete(given, max_episode_steps, n_tasks))
         if self.env is not None:
-            rollout = self.n_tasks_per_rollout * self.n_episodes_per_task * max_episode_steps
+            rollout = n_tasks * self.n_episodes_per_task * max_episode_steps
             if rollout > MAX_STEPS_PER_UPDATE * self.gradient_steps:
                 warnings.warn(
                     f"gradient_steps is {self.gradient_steps}, the updates after a rollout of {rollout} env steps. Left out, "
@@ -388,19 +388,19 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         return adaptation.act(obs, deterministic=False)
 
     def _next_step(self, steps: Iterator[Step], tasks: np.ndarray) -> Step | None:
-        """One more step, None at the end; failures of an env say where."""
-        where = f"at env step {self.num_timesteps}, on one of the training tasks {tasks.tolist()}"
+        """One more step, None at the end; failures say where."""
+        where = f"At env step {self.num_timesteps}, on one of the training tasks {tasks.tolist()}"
         try:
             return next(steps, None)
         except ValueError as error:
             # Where SB3 stores what the env returned; within the env, an error is the env's own
             stored = traceback.extract_tb(error.__traceback__)[-1].name == "_save_obs"
-            shape = ": its observations must have the shape of its observation_space" if stored else ""
-            raise ValueError(f"An env failed {where} ({error}){shape}.") from error
+            shape = ": an env's observations must have the shape of its observation_space" if stored else ""
+            raise ValueError(f"{where}: {error}{shape}") from error
         except (EOFError, ConnectionError) as error:
             raise RuntimeError(
-                f"The process of an env died {where}: its own traceback is printed above. Envs in one process (vec_env dummy) "
-                "show it here."
+                f"{where}, the process of an env died: its own traceback is printed above. Envs in one process (vec_env "
+                "dummy) show it here."
             ) from error
 
     def _learn_knowledge(self, means: th.Tensor) -> None:

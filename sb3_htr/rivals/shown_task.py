@@ -4,12 +4,12 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_htr.common.checks import check_has_hooks, check_spaces, get_task_family
 from sb3_htr.common.type_aliases import TaskFamily, Trajectory
-from sb3_htr.common.vec_env import set_tasks
+from sb3_htr.common.vec_env import CopiedWrapper, set_tasks
 
 
 class ShownTask:
@@ -52,7 +52,7 @@ class ShownTask:
         return {"observation": obs, "achieved_goal": self.achieved(obs), "desired_goal": tasks}
 
 
-class ShownTaskVecEnv(VecEnvWrapper):
+class ShownTaskVecEnv(CopiedWrapper):
     """
     Shows the task, which the env draws for each episode.
 

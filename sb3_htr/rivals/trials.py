@@ -4,12 +4,12 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_htr.common.checks import check_spaces, get_max_episode_steps, get_task_family
 from sb3_htr.common.settings import check_numbers
-from sb3_htr.common.vec_env import set_tasks
+from sb3_htr.common.vec_env import CopiedWrapper, set_tasks
 from sb3_htr.rivals.base import scaled
 
 
@@ -49,7 +49,7 @@ class LastStep:
         return np.concatenate([obs, self.columns], axis=1, dtype=np.float32)
 
 
-class TrialVecEnv(VecEnvWrapper):
+class TrialVecEnv(CopiedWrapper):
     """
     Each episode of it is a trial: ``n_episodes`` episodes of the env on one training task, which the env draws. An observation
     is that of the env with :class:`LastStep` beside it. A trial's end is a true end, whatever its last episode ended with.

@@ -290,7 +290,7 @@ def test_a_file_is_loaded_as_what_it_is_and_with_settings_that_are_known(tiny_pe
     assert loaded.gamma == 0.9 and loaded._stats_window_size == 7
     env = make_task_vec_env(ENV_ID, 3)
     follows = PEARL.load(tmp_path / "model", env=env, gamma=None, gradient_steps=None, n_tasks_per_rollout=4)
-    plain = PEARL("MlpPolicy", env, n_tasks_per_rollout=6, n_episodes_per_task=follows.n_episodes_per_task)
+    plain = PEARL("MlpPolicy", env, n_tasks_per_rollout=4, n_episodes_per_task=follows.n_episodes_per_task)
     for name in ("gamma", "gradient_steps", "n_tasks_per_rollout"):
         assert getattr(follows, name) == getattr(plain, name), name
     SAC("MlpPolicy", "Pendulum-v1").save(tmp_path / "sac")

@@ -4,6 +4,7 @@ import copy
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 import torch as th
 
@@ -44,3 +45,11 @@ def test_it_goes_on_exactly(make: Callable[[], Any]) -> None:
     assert second.num_timesteps == unbroken.num_timesteps and second._n_updates == unbroken._n_updates
     for name, value in unbroken.policy.state_dict().items():
         assert th.equal(value, second.policy.state_dict()[name]), name
+
+
+@pytest.mark.parametrize("make", [rl2, sac_her])
+def test_a_deep_copy_has_an_env_of_its_own_with_all_wrappers(make: Callable[[], Any]) -> None:
+    model = make()
+    twin = copy.deepcopy(model)
+    assert type(twin.env) is type(model.env) and twin.env is not model.env
+    np.testing.assert_equal(twin.env.reset(), model.env.reset())

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rl_zoo3.exp_manager import ExperimentManager
 
 from helpers import ENV_ID
 from helpers.runs import run_folder, train_arguments
@@ -72,3 +73,17 @@ def test_a_run_that_is_being_trained_cannot_be_gone_on_with(tmp_path: Path, monk
     assert main(["train", "--resume", str(run)]) == 0, "a process that is killed owns nothing any more"
     assert (run / f"{ENV_ID}.zip").exists()
     lock(run).release()
+
+
+def test_a_run_has_its_owner_until_its_last_model_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    saved = []
+
+    def save(manager: Any, model: Any) -> None:
+        with pytest.raises(ValueError, match="is being trained by another process"):
+            lock(Path(manager.save_path))
+        saved.append(Path(manager.save_path))
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(ExperimentManager, "save_trained_model", save)
+    assert main(train_arguments(Path("runs"), 240)) == 0
+    lock(saved[0]).release()

@@ -244,7 +244,8 @@ class MetaExperimentManager(ExperimentManager):
             self._checkpointing.restore(cast(Any, model), self._checkpoint)
             done = model.num_timesteps
         log_interval = {-1: 1}.get(self.log_interval, self.log_interval if self.log_interval > 0 else None)
-        with _soft_interrupt(self._checkpointing):
+        with contextlib.ExitStack() as on_failure, _soft_interrupt(self._checkpointing):
+            on_failure.callback(self._lock.release)
             try:
                 n_steps = max(int(self.n_timesteps) - done, 0)
                 model.learn(n_steps, self.callbacks, log_interval, reset_num_timesteps=not done)  # type: ignore[arg-type]
@@ -260,7 +261,8 @@ class MetaExperimentManager(ExperimentManager):
                 assert model.env is not None
                 with contextlib.suppress(EOFError, ConnectionError):  # of envs in processes that have died
                     model.env.close()
-                self._lock.release()
+            # The last model is still to be written
+            on_failure.pop_all()
 
     def _to_go_on(self) -> str:
         packages = [name for name in self.args.gym_packages if name not in PACKAGES]
@@ -296,6 +298,8 @@ class MetaExperimentManager(ExperimentManager):
             raise OSError(
                 f"The last model could not be written to {self.save_path} ({reason(error)}): mend that, and {again}."
             ) from error
+        finally:
+            self._lock.release()
 
     def objective(self, trial: optuna.Trial) -> float:
         """
