@@ -19,7 +19,7 @@ PARTS = {
     "stepping the envs": "env.step",
     "choosing actions": "policy.act",
     "best episodes of training tasks": "task_bank.update",
-    "what explorers start from": "_learn_knowledge",
+    "what explorers start from": "knowledge.learn",
     "Python between the operations of updates": "_update",
 }
 

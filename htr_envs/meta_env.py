@@ -222,7 +222,7 @@ class MetaEnv(gym.Env[FloatArray, FloatArray], ABC):
         if isinstance(state, tuple) or np.shape(state) != self.observation_space.shape:
             given = "a tuple" if isinstance(state, tuple) else f"shape {np.shape(state)}"
             raise ValueError(
-                "_reset_state returns an observation; _step_state an observation, a task-free reward and whether the episode "
+                "_reset_state returns an observation; _step_state an observation, a reward and whether the episode "
                 f"terminates. Expected an observation of shape {self.observation_space.shape}, got {given}."
             )
         observation: FloatArray = np.array(state, dtype=self.observation_space.dtype)
@@ -252,7 +252,7 @@ class MetaEnv(gym.Env[FloatArray, FloatArray], ABC):
         stepped = self._step_state(action)
         if len(stepped) != 3:
             raise ValueError(
-                "_step_state must return an observation, a task-free reward and whether the episode terminates, got "
+                "_step_state must return an observation, a reward and whether the episode terminates, got "
                 f"{len(stepped)} values."
             )
         state, reward, terminated = stepped

@@ -136,7 +136,7 @@ class TaskVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]], ABC):
         return self._observations.copy(), {"task_id": self.task_ids}
 
     def _begin_episodes(self, observations: FloatArray, indices: NDArray[np.int64]) -> None:
-        # drawn for all of them even if it is not used, for the reason given in TaskEnv.reset
+        # drawn for all of them even if it is not used, for the reason given in MetaEnv.reset
         drawn = self.np_random.integers(len(self.task_family.train_tasks), size=len(indices))
         given = self._given[indices]
         self._task_ids[indices] = np.where(given, self._given_ids[indices], drawn)

@@ -91,7 +91,9 @@ def test_particles_and_belief_are_the_same(tiny_pearl: MakePEARL) -> None:
         # Random episodes, and the same networks
         model = tiny_pearl(point_robots(4, wage), learning_starts=10_000, gamma=0.9).learn(2 * ROLLOUT)
         expect(model, wage)
-        model._learn_knowledge(th.randn(20, 3, generator=th.Generator().manual_seed(0)))
+        assert model.task_bank is not None
+        means = th.randn(20, 3, generator=th.Generator().manual_seed(0))
+        model.knowledge.learn(model.policy, means, model.task_bank, model.gamma)
         models.append(model)
         outcomes.append(evaluate_adaptation(model, point_robots(20, wage), n_episodes=4))
     plain, shifted = (model.knowledge for model in models)

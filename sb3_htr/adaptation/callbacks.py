@@ -43,7 +43,7 @@ class MetaEvalCallback(EvalCallback):
         explorer: Any = None,
         **kwargs: Any,
     ) -> None:
-        check_numbers(n_eval_episodes=(n_eval_episodes, 1, float("inf")))
+        check_numbers(n_eval_episodes=(n_eval_episodes, 1))
         if isinstance(eval_env, str):
             eval_env = make_task_vec_env(eval_env, N_ENVS)
         super().__init__(eval_env, n_eval_episodes=n_eval_episodes, **kwargs)

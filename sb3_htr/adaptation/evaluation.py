@@ -90,7 +90,7 @@ def run_adaptation(
     :return: one row per env
     :raises ValueError: if there are no episodes
     """
-    check_numbers(n_episodes=(n_episodes, 1, float("inf")))
+    check_numbers(n_episodes=(n_episodes, 1))
     n_envs = env.num_envs
     episode, envs = np.zeros(n_envs, dtype=np.int64), np.arange(n_envs)
     returns = np.zeros((n_envs, n_episodes + 1))

@@ -34,13 +34,14 @@ def make(setting: str, value: Any, kinds: Mapping[str, Callable[..., Kind]], bas
     return kinds[name](**settings)
 
 
-def check_numbers(**numbers: tuple[Any, float, float]) -> None:
+def check_numbers(**numbers: tuple[Any, float] | tuple[Any, float, float]) -> None:
     """
-    :param numbers: name of a setting, its value, and the smallest and largest value that it may have; with an int as the
-        smallest one, it must be a whole number
+    :param numbers: name of a setting, its value, and the smallest and, if there is one, the largest value that it may have;
+        with an int as the smallest one, it must be a whole number
     :raises ValueError: for the first one that is none, or out of its range
     """
-    for name, (value, low, high) in numbers.items():
+    for name, (value, low, *largest) in numbers.items():
+        high = largest[0] if largest else float("inf")
         whole = isinstance(low, int)
         kind = int | np.integer if whole else int | float | np.number
         # written so that nan, which compares with nothing, is refused too

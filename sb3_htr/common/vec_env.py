@@ -231,7 +231,7 @@ def make_task_vec_env(
     :raises ValueError: for an env without tasks, or no envs
     :raises gymnasium.error.NameNotFound: for an id that is not registered
     """
-    check_numbers(n_envs=(n_envs, 1, float("inf")))
+    check_numbers(n_envs=(n_envs, 1))
     module, _, env_id = env_id.rpartition(":")
     if module:
         importlib.import_module(module)

@@ -36,6 +36,7 @@ def calibration(model: Model, env_id: str, env_kwargs: KwArgs, n_episodes: int) 
     obs = reset_to_tasks(env, tasks)
     policy, adaptation = model.policy, model.start_adaptation(len(tasks), generator=th.Generator().manual_seed(0))
     steps = list(adaptation_steps(env, adaptation, n_episodes, policy.unscale_action, adaptation.act, obs))
+    env.close()
     # (n_tasks, n_steps, ...) each
     obs, actions, rewards, next_obs, dones = (np.stack(column, axis=1) for column in list(zip(*steps, strict=True))[:5])
     traj = Trajectory(obs, policy.unscale_action(actions), next_obs, np.zeros_like(rewards, dtype=np.float32))

@@ -46,7 +46,8 @@ def evaluate(cell: Cell, model: Model, trained_with: Any = None) -> KwArgs:
         records = [
             evaluate_adaptation(model, env, n_episodes=cell.n_episodes, explorer=explorer, seed=seed) for seed in EVAL_SEEDS
         ]
-        returns, successes = (np.stack(arrays) for arrays in zip(*records, strict=True))
+        env.close()
+        returns, successes = map(np.stack, zip(*records, strict=True))
         arrays |= {f"returns_{evaluation.name}": returns.astype(np.float32), f"successes_{evaluation.name}": successes}
     return {**arrays, "calibration": calibration(model, cell.env_id, cell.env_kwargs, cell.n_episodes)}
 

@@ -1,7 +1,7 @@
 """Task-indexed replay with hindsight task relabelling at sample time."""
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,6 @@ from sb3_htr.htr.episode_store import EpisodeStore
 from sb3_htr.htr.groups import first_rows, positions
 from sb3_htr.htr.n_step import n_step_returns, steps_ahead
 from sb3_htr.htr.relabel import RELABELLERS, Relabeller
-from sb3_htr.htr.reward_hook import check_reward_hook
 from sb3_htr.htr.transitions import Transitions
 
 
@@ -101,8 +100,8 @@ class MultiTaskReplayBuffer(ReplayBuffer):
     ) -> None:
         check_numbers(
             relabel_probability=(relabel_probability, 0.0, 1.0),
-            context_episodes=(context_episodes, 1, float("inf")),
-            buffer_size=(buffer_size, 1, float("inf")),
+            context_episodes=(context_episodes, 1),
+            buffer_size=(buffer_size, 1),
         )
         if rl_reward_type not in ("sparse", "dense"):
             raise ValueError(f'rl_reward_type is {rl_reward_type!r}, expected "sparse" or "dense".')
@@ -276,15 +275,6 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         columns: dict[str, slice | int] = {name: getattr(self.transitions, name) for name in names}
         name = next(name for name, column in columns.items() if not np.isfinite(rows[i, column]).all())
         raise ValueError(f"The {name} of task {task[i]} (env {i}) is {rows[i, columns[name]]}, expected finite numbers.")
-
-    def check_reward_hook(self, episodes: Sequence[tuple[int, np.ndarray]]) -> None:
-        """
-        See :func:`sb3_htr.htr.reward_hook.check_reward_hook`; nothing is checked of a family that tells no rewards.
-
-        :param episodes: training tasks and transitions (length, width) of some episodes
-        """
-        if self.tells_rewards:
-            check_reward_hook(self.task_family, self.transitions, episodes, self.relabel_probability > 0)
 
     def discard_open_episodes(self) -> None:
         """Forget unfinished episodes; to be called when the envs are reset before their episodes end."""

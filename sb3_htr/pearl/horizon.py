@@ -54,11 +54,9 @@ def complete(given: dict[str, Any], max_episode_steps: int, n_tasks_per_rollout:
     :return: all of them
     :raises ValueError: for one that is out of its range
     """
-    infinity, lowest = float("inf"), {"gamma": 0.0, "learning_starts": 0}
     chosen = {name: value for name, value in given.items() if value is not None}
-    check_numbers(
-        **{name: (value, lowest.get(name, 1), 1.0 if name == "gamma" else infinity) for name, value in chosen.items()}
-    )
+    limits: dict[str, Any] = {"gamma": (0.0, 1.0), "learning_starts": (0,)}
+    check_numbers(**{name: (value, *limits.get(name, (1,))) for name, value in chosen.items()})
     return settings_for(max_episode_steps, n_tasks_per_rollout, chosen.get("n_episodes_per_task")) | chosen
 
 

@@ -38,6 +38,7 @@ from sb3_htr.common.settings import check_keywords, check_numbers
 from sb3_htr.common.training_state import Resumable
 from sb3_htr.common.vec_env import in_float32, make_task_vec_env
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
+from sb3_htr.htr.reward_hook import check_reward_hook
 from sb3_htr.pearl.horizon import BY_HORIZON, STEPS_PER_UPDATE, complete, timesteps_for
 from sb3_htr.pearl.policies import PEARLPolicy
 
@@ -99,7 +100,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         **kwargs: Any,
     ) -> None:
         checks.check_device(kwargs.get("device", "auto"))
-        check_numbers(n_tasks_per_rollout=(n_tasks_per_rollout, 1, float("inf")))
+        check_numbers(n_tasks_per_rollout=(n_tasks_per_rollout, 1))
         self.explorer, self.train_explorer = to_explorer(explorer), to_explorer(train_explorer)
         buffer_class = replay_buffer_class or MultiTaskReplayBuffer
         check_keywords("replay_buffer_kwargs", replay_buffer_kwargs or {}, buffer_class)
@@ -159,7 +160,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
     def _complete_settings(self) -> None:
         # Without an env, which is for files alone, the settings come from there
         max_episode_steps = n_envs = 1
-        check_numbers(n_tasks_per_rollout=(self.n_tasks_per_rollout, 1, float("inf")))
+        check_numbers(n_tasks_per_rollout=(self.n_tasks_per_rollout, 1))
         if self.env is not None:
             max_episode_steps, n_envs = checks.get_max_episode_steps(self.env), self.env.num_envs
         # All envs are stepped, as often as it takes
@@ -331,7 +332,9 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         )
         if continue_training:
             # In each rollout: a sparse reward can go unseen for many, and the env may be another one than before
-            replay_buffer.check_reward_hook(self.task_bank.new)
+            if replay_buffer.tells_rewards:
+                relabelled = replay_buffer.relabel_probability > 0
+                check_reward_hook(replay_buffer.task_family, replay_buffer.transitions, self.task_bank.new, relabelled)
             # Now and not step by step: what a posterior takes in during a rollout stays on one scale
             columns = replay_buffer.transitions
             self.policy.watch(np.concatenate([episode[:, columns.observation] for _, episode in self.task_bank.new]))
@@ -403,13 +406,6 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
                 "dummy) show it here."
             ) from error
 
-    def _learn_knowledge(self, means: th.Tensor) -> None:
-        """
-        :param means: (n, latent_dim), posterior means of recent meta-batches
-        """
-        assert self.task_bank is not None
-        self.knowledge.learn(self.policy, means, self.task_bank, self.gamma)
-
     # Meta-test
 
     def check_env(self, env: VecEnv) -> None:
@@ -438,7 +434,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         """
         chosen = self.explorer if explorer in (None, self.explorer.name) else to_explorer(explorer)
         self._check_explorer(chosen)
-        check_numbers(n_envs=(n_envs, 1, float("inf")))
+        check_numbers(n_envs=(n_envs, 1))
         return Adaptation(
             self.policy,
             self.knowledge,
@@ -476,7 +472,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
             env does not say so (``info["is_success"]``), whether a reward was told from what is task-free
         :raises ValueError: for several envs, an env with other spaces, a task that the env does not have, episodes without end
         """
-        check_numbers(n_episodes=(n_episodes, 1, float("inf")))
+        check_numbers(n_episodes=(n_episodes, 1))
         vec_env = self._wrap_env(make_task_vec_env(env) if isinstance(env, str) else env, monitor_wrapper=False)
         if vec_env.num_envs != 1:
             raise ValueError(f"adapt() adapts to one task, but the VecEnv has {vec_env.num_envs} envs: pass a single env.")

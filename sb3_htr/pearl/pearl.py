@@ -167,13 +167,12 @@ class PEARL(OffPolicyMetaAlgorithm):
             self._setup_model()
 
     def _setup_model(self) -> None:
-        infinity = float("inf")
         check_numbers(
-            meta_batch_size=(self.meta_batch_size, 1, infinity),
-            target_update_interval=(self.target_update_interval, 1, infinity),
-            kl_coef=(self.kl_coef, 0.0, infinity),
-            final_kl_coef=(self.kl_coef if self.final_kl_coef is None else self.final_kl_coef, 0.0, infinity),
-            reward_coef=(self.reward_coef, 0.0, infinity),
+            meta_batch_size=(self.meta_batch_size, 1),
+            target_update_interval=(self.target_update_interval, 1),
+            kl_coef=(self.kl_coef, 0.0),
+            final_kl_coef=(self.kl_coef if self.final_kl_coef is None else self.final_kl_coef, 0.0),
+            reward_coef=(self.reward_coef, 0.0),
             tau=(self.tau, 0.0, 1.0),
         )
         if self.tau == 0:
@@ -213,7 +212,8 @@ class PEARL(OffPolicyMetaAlgorithm):
             self.logger.record(key, value)
         self.logger.record("train/kl_coef", self._current_kl_coef())
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self._learn_knowledge(th.cat(means[-20:]))
+        assert self.task_bank is not None
+        self.knowledge.learn(self.policy, th.cat(means[-20:]), self.task_bank, self.gamma)
 
     def _current_kl_coef(self) -> float:
         if self.final_kl_coef is None:

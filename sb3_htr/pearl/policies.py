@@ -97,7 +97,7 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
-        check_numbers(latent_dim=(latent_dim, 1, float("inf")))
+        check_numbers(latent_dim=(latent_dim, 1))
         if optimizer_class is th.optim.Adam:
             optimizer_kwargs = {"fused": True, **(optimizer_kwargs or {})}
         self.latent_dim = latent_dim

@@ -98,10 +98,7 @@ class RL2(Rival, RecurrentPPO):
         seed: int | None = None,
         **kwargs: Any,
     ) -> None:
-        infinity = float("inf")
-        check_numbers(
-            n_episodes_per_trial=(n_episodes_per_trial, 1, infinity), n_trials_per_rollout=(n_trials_per_rollout, 1, infinity)
-        )
+        check_numbers(n_episodes_per_trial=(n_episodes_per_trial, 1), n_trials_per_rollout=(n_trials_per_rollout, 1))
         if "n_steps" in kwargs:
             raise ValueError("n_steps follows from n_trials_per_rollout: a rollout is whole trials.")
         if isinstance(env, str):

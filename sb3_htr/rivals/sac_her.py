@@ -114,7 +114,7 @@ class SACHER(Rival, SAC):
         seed: int | None = None,
         **kwargs: Any,
     ) -> None:
-        check_numbers(gradient_steps=(gradient_steps, -1, float("inf")))
+        check_numbers(gradient_steps=(gradient_steps, -1))
         for name in ("train_freq", "replay_buffer_class"):
             if name in kwargs:
                 raise ValueError(f"SACHER has no setting {name!r}: a rollout is an episode of each env, and replay is HER's.")

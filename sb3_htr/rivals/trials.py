@@ -59,7 +59,7 @@ class TrialVecEnv(CopiedWrapper):
     """
 
     def __init__(self, venv: VecEnv, n_episodes: int) -> None:
-        check_numbers(n_episodes=(n_episodes, 1, float("inf")))
+        check_numbers(n_episodes=(n_episodes, 1))
         check_spaces(venv)
         get_task_family(venv)
         obs, action = venv.observation_space, venv.action_space

@@ -41,11 +41,10 @@ class Aggregate(Explorer):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        infinity = float("inf")
         check_numbers(
-            scale=(self.scale, 0.0, infinity),
-            max_setbacks=(self.max_setbacks, 0, infinity),
-            clearly_better=(self.clearly_better, 1.0, infinity),
+            scale=(self.scale, 0.0),
+            max_setbacks=(self.max_setbacks, 0),
+            clearly_better=(self.clearly_better, 1.0),
         )
 
     def start(self) -> None:

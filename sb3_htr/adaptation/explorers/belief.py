@@ -43,7 +43,7 @@ class Belief(ParticleExplorer):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_numbers(margin=(self.margin, 0.0, float("inf")), kept=(self.kept, 0.0, 1.0))
+        check_numbers(margin=(self.margin, 0.0), kept=(self.kept, 0.0, 1.0))
 
     def start(self) -> None:
         super().start()

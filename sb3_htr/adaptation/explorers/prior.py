@@ -25,7 +25,7 @@ class FixedExploration(Explorer):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_numbers(n_exploration_episodes=(self.n_exploration_episodes, 0, float("inf")))
+        check_numbers(n_exploration_episodes=(self.n_exploration_episodes, 0))
 
     def exploring(self) -> np.ndarray:
         return np.asarray(self.adaptation.n_episodes < self.n_exploration_episodes)

@@ -51,24 +51,13 @@ class HindsightBuffers(Relabeller):
         """Number of hindsight buffers that hold something."""
         return int(np.count_nonzero(self.episodes.n_added))
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes of memory that the episodes of all hindsight buffers take."""
-        return self.episodes.nbytes
-
-    def rewarded_fraction(self) -> tuple[float, float]:
-        """
-        :return: share of the stored episodes with a reward beside the task-free one, in the real and in the hindsight buffers
-        """
-        return self.buffer.rewarded_fraction(self.buffer.episodes), self.buffer.rewarded_fraction(self.episodes)
-
     def stats(self) -> dict[str, float]:
-        real, hindsight = self.rewarded_fraction()
+        real, hindsight = (self.buffer.rewarded_fraction(episodes) for episodes in (self.buffer.episodes, self.episodes))
         return {
             "replay/rewarded_fraction_real": real,
             "replay/rewarded_fraction_hindsight": hindsight,
             "replay/n_hindsight_buffers": self.n_hindsight_buffers,
-            "replay/hindsight_megabytes": self.nbytes / 1e6,
+            "replay/hindsight_megabytes": self.episodes.nbytes / 1e6,
         }
 
     def state_dict(self) -> dict[str, Any]:

@@ -28,8 +28,7 @@ class HindsightForesight(TrainingTaskRelabelling):
 
     def __init__(self, temperature: float = 0.01, context_size: int = 20, n_starts: int = 4) -> None:
         super().__init__(temperature)
-        infinity = float("inf")
-        check_numbers(context_size=(context_size, 1, infinity), n_starts=(n_starts, 1, infinity))
+        check_numbers(context_size=(context_size, 1), n_starts=(n_starts, 1))
         self.context_size = context_size
         self.n_starts = n_starts
 

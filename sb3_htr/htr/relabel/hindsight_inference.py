@@ -32,7 +32,7 @@ class HindsightInference(TrainingTaskRelabelling):
         super().__init__(temperature)
         if level not in LEVELS:
             raise ValueError(f'level is {level!r}, expected "episode" or "transition".')
-        check_numbers(context_size=(context_size, 1, float("inf")))
+        check_numbers(context_size=(context_size, 1))
         self.level = level
         self.in_order = level == "episode"
         self.context_size = context_size

@@ -79,7 +79,7 @@ class SingleEpisodeRelabelling(Relabeller):
         check_numbers(
             elsewhere=(elsewhere, 0.0, 1.0),
             like_training=(like_training, 0.0, 1.0),
-            context_episodes=(context_episodes, 1, float("inf")),
+            context_episodes=(context_episodes, 1),
         )
         check_flags(prefer_unsolved=prefer_unsolved)
         self.elsewhere = elsewhere

@@ -33,7 +33,7 @@ class TrainingTaskRelabelling(HindsightBuffers):
     """
 
     def __init__(self, temperature: float = 0.01) -> None:
-        check_numbers(temperature=(temperature, 0.0, float("inf")))
+        check_numbers(temperature=(temperature, 0.0))
         if temperature == 0:
             raise ValueError("temperature is 0, by which utilities cannot be divided: expected a number above 0.")
         self.temperature = temperature
@@ -85,8 +85,9 @@ class TrainingTaskRelabelling(HindsightBuffers):
 
     def _choose(self, logits: np.ndarray) -> np.ndarray:
         """(n_units,) int, a task for each unit."""
-        logits = logits - _log_mean_exp(logits, axis=0)
-        log_q = logits - _log_mean_exp(logits, axis=1) - np.log(logits.shape[1])
+        # Each task's partition function, a mean over the units: by how much the sum is larger is the same for all tasks
+        logits = logits - np.logaddexp.reduce(logits, axis=0)
+        log_q = logits - np.logaddexp.reduce(logits, axis=1, keepdims=True)
         self._entropy = float(-(np.exp(log_q) * log_q).sum(axis=1).mean())
         # The largest of logits with Gumbel noise is a draw from their softmax
         chosen: np.ndarray = (logits + self.buffer.relabel_rng.gumbel(size=logits.shape)).argmax(axis=1)
@@ -108,12 +109,6 @@ class TrainingTaskRelabelling(HindsightBuffers):
         super().load_state_dict(state)
         self._new = [episode.numpy().copy() for episode in state["new"].split(state["lengths"].tolist())]
         self._entropy = state["entropy"]
-
-
-def _log_mean_exp(x: np.ndarray, axis: int) -> np.ndarray:
-    """Of x along an axis, which is kept."""
-    largest = x.max(axis=axis, keepdims=True)
-    return np.asarray(largest + np.log(np.exp(x - largest).mean(axis=axis, keepdims=True)))
 
 
 def _cut(count: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:

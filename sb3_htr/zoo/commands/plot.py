@@ -51,7 +51,7 @@ class Adapted(NamedTuple):
     :param tasks: (n_tasks, task_dim)
     :param goal_radius: radius of the goals, if the tasks are places with one
     :param start: where all episodes begin, if tasks are points of a plane
-    :param explorer: that chose z before the reward was found
+    :param explorer: that chose z
     :param record: what happened
     :param latent: None for an agent that has no latent space
     """

@@ -81,7 +81,7 @@ class MetaExperimentManager(ExperimentManager):
         :return: hyperparameters, and the same sorted to be saved
         """
         if self.n_timesteps != -1:
-            check_numbers(n_timesteps=(self.n_timesteps, 1, float("inf")))
+            check_numbers(n_timesteps=(self.n_timesteps, 1))
         given, trial_id = dict(self.custom_hyperparams or {}), self.trial_id
         self.custom_hyperparams, self.trial_id = None, None
         with contextlib.redirect_stdout(StringIO()):  # it prints what is not all of it
@@ -148,7 +148,7 @@ class MetaExperimentManager(ExperimentManager):
             if misplaced := sorted(hyperparams.keys() & keywords_of(owner) - own):
                 raise ValueError(f"{misplaced[0]} is a setting within {name}: -params \"{name}:{{'{misplaced[0]}':...}}\".")
         check_keywords(model_class.__name__, hyperparams, model_class, also=ZOO_SETTINGS)
-        check_numbers(n_envs=(hyperparams.get("n_envs", 1), 1, float("inf")))
+        check_numbers(n_envs=(hyperparams.get("n_envs", 1), 1))
         processed = super()._preprocess_hyperparams(hyperparams)
         if self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = dict(self.env_kwargs)

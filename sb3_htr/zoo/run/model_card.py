@@ -24,7 +24,7 @@ TAGS = (
 # Adaptation episodes in the table, and the last one
 SHOWN = (1, 2, 3, 5, 10)
 PEARL = "PEARL (Rakelly et al., 2019)"
-OF_EXPLORERS = """ The explorer says how z is chosen before the first reward;
+OF_EXPLORERS = """ The explorer says how z is chosen;
 `prior` is the protocol of PEARL's paper."""
 # Arguments of a training that change nothing of its result, or name what is on one machine alone, with the number of their
 # values. What a study or a file of settings brought is among the hyperparameters of the card
