@@ -1,5 +1,6 @@
 """Checkpoints from which a training goes on as if it had never stopped."""
 
+import io
 import shutil
 import time
 import warnings
@@ -8,11 +9,13 @@ from pathlib import Path
 from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
+import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import TensorBoardOutputFormat
 
 from sb3_htr.common.atomic import WRITE_ERRORS, atomic_path, reason
 from sb3_htr.common.checkpoint import DamagedCheckpoint, read_checkpoint, write_checkpoint
+from sb3_htr.common.settings import check_numbers
 
 # What is recorded but not written yet
 LOGGER_STATE = ("name_to_value", "name_to_count", "name_to_excluded")
@@ -99,6 +102,7 @@ class CheckpointCallback(BaseCallback):
     :param companions: callbacks of the same training; the state of those that have one is saved too
     :param name_prefix: for SB3's signature, not used
     :param verbose: 1 says where checkpoints are written
+    :raises ValueError: if none would be kept
     """
 
     def __init__(
@@ -111,6 +115,7 @@ class CheckpointCallback(BaseCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
+        check_numbers(keep=(keep, 1))
         self.save_freq = save_freq
         self.run = Path(save_path)
         self.keep = keep
@@ -159,7 +164,13 @@ class CheckpointCallback(BaseCallback):
                 )
             for name in LOGGER_STATE:
                 getattr(self.logger, name).update(self._pending["logger"][name])
-            for output, folder in zip(self._tensorboards(), self._pending["tensorboard_folders"], strict=True):
+            outputs, folders = self._tensorboards(), self._pending["tensorboard_folders"]
+            if len(outputs) != len(folders):
+                raise ValueError(
+                    f"The training was logged to {len(folders)} folders of TensorBoard, and goes on with {len(outputs)}: make "
+                    "the model with the tensorboard_log that it had."
+                )
+            for output, folder in zip(outputs, folders, strict=True):
                 # Takes back what was logged after the checkpoint
                 writer = type(output.writer)(log_dir=folder, purge_step=self.num_timesteps + 1)
                 output.writer.close()
@@ -169,6 +180,7 @@ class CheckpointCallback(BaseCallback):
             self.model._num_timesteps_at_start = self._pending["num_timesteps_at_start"]
             self._pending = None
             return
+        self._callback_states()  # one that cannot be saved says so before any work is done
         beyond = [folder for folder in checkpoints(self.run) if _n_steps(folder) > self.num_timesteps]
         if beyond:
             raise ValueError(
@@ -221,17 +233,37 @@ class CheckpointCallback(BaseCallback):
     def _state(self) -> dict[str, Any]:
         return {
             "model": cast(HasState, self.model).state_dict(),
-            "logger": {name: _plain(getattr(self.logger, name)) for name in LOGGER_STATE},
-            "callbacks": [
-                {"n_calls": callback.n_calls, "state": callback.state_dict() if isinstance(callback, HasState) else None}
-                for callback in (self, *self.companions)
-            ],
+            "logger": self._logger_state(),
+            "callbacks": self._callback_states(),
             "elapsed_ns": time.time_ns() - int(self.model.start_time),
             "num_timesteps_at_start": self.model._num_timesteps_at_start,
             "monitor_files": self._monitor_files(),
             "tensorboard_folders": [str(output.writer.log_dir) for output in self._tensorboards()],
         }
 
+    def _logger_state(self) -> dict[str, dict[str, Any]]:
+        """What is a number or a text; a figure that waits for the next log is not kept."""
+        values = {
+            key: value.item() if isinstance(value, np.generic | np.ndarray) and value.ndim == 0 else value
+            for key, value in self.logger.name_to_value.items()
+        }
+        values = {key: value for key, value in values.items() if isinstance(value, int | float | str)}
+        others = {name: getattr(self.logger, name) for name in LOGGER_STATE[1:]}
+        return {LOGGER_STATE[0]: values} | {name: {k: v for k, v in x.items() if k in values} for name, x in others.items()}
 
-def _plain(values: dict[str, Any]) -> dict[str, Any]:
-    return {key: value.item() if isinstance(value, np.generic) else value for key, value in values.items()}
+    def _callback_states(self) -> list[dict[str, Any]]:
+        states = []
+        for callback in (self, *self.companions):
+            state = callback.state_dict() if isinstance(callback, HasState) else None
+            file = io.BytesIO()
+            try:
+                th.save(state, file)
+                file.seek(0)
+                th.load(file, weights_only=True)
+            except Exception as error:
+                raise ValueError(
+                    f"The state_dict() of {type(callback).__name__} cannot be saved: it may hold tensors, numbers of Python, "
+                    "texts and None, in lists, tuples and dicts."
+                ) from error
+            states.append({"n_calls": callback.n_calls, "state": state})
+        return states

@@ -64,6 +64,10 @@ class Resumable(BaseAlgorithm):
 
     def _set_random_state(self, state: dict[str, Any]) -> None:
         assert self.env is not None
+        if len(state["envs"]) != self.env.num_envs:
+            raise ValueError(
+                f"The training had {len(state['envs'])} envs, and goes on with {self.env.num_envs}: give it as many."
+            )
         set_global_state(state["global"])
         set_generator_state(self.action_space.np_random, state["actions"])
         for i, (generator, saved) in enumerate(zip(self.env.get_attr("np_random"), state["envs"], strict=True)):
@@ -81,10 +85,10 @@ class Resumable(BaseAlgorithm):
         return [*super()._excluded_save_params(), "_pending_random"]
 
 
-def _tensor(value: Any) -> th.Tensor:
-    """A number or array, with its dtype: means of float32 numbers are other ones than those of float64."""
-    return th.from_numpy(np.array(value))
+def _tensor(value: Any) -> Any:
+    """A number or array, with its dtype: means of float32 numbers are other ones than those of float64. Texts stay texts."""
+    return value if isinstance(value, str) else th.from_numpy(np.array(value))
 
 
-def _number(tensor: th.Tensor) -> Any:
-    return tensor.cpu().numpy()[()]
+def _number(tensor: Any) -> Any:
+    return tensor if isinstance(tensor, str) else tensor.cpu().numpy()[()]

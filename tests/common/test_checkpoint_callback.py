@@ -1,0 +1,83 @@
+"""What a checkpoint can hold, it holds; what it cannot, nobody learns of when the training is to go on."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import matplotlib.figure
+import numpy as np
+import pytest
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Figure, HParam
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from helpers import ENV_ID, ROLLOUT, MakePEARL
+from sb3_htr.common.resume import CheckpointCallback, load_latest
+from sb3_htr.common.vec_env import make_task_vec_env
+
+
+class Records(BaseCallback):
+    """All that SB3's logger takes."""
+
+    def _on_step(self) -> bool:
+        figure = matplotlib.figure.Figure()
+        values = {"array": np.zeros(3), "figure": Figure(figure, close=True), "hparams": HParam({"a": 1}, {"b": 2.0})}
+        for name, value in {**values, "file": Path("file"), "mean": np.array(0.5), "number": np.float64(2.5)}.items():
+            self.logger.record(name, value, exclude=("stdout", "log", "json", "csv"))
+        return True
+
+
+class HasNumbersOfNumpy(BaseCallback):
+    def _on_step(self) -> bool:
+        return True
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"best": np.float64(1.0)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        pass
+
+
+class InAKitchen(gym.Wrapper):
+    def step(self, action: Any) -> Any:
+        *others, info = self.env.step(action)
+        return *others, {**info, "scene": "kitchen"}
+
+
+def test_what_waits_for_the_log_does_not_spoil_a_checkpoint(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    tiny_pearl().learn(2 * ROLLOUT, [Records(), CheckpointCallback(1, str(tmp_path))], log_interval=None)
+    _, state = load_latest(tmp_path)
+    assert state["logger"]["name_to_value"].items() >= {"mean": 0.5, "number": 2.5}.items()
+    assert state["logger"]["name_to_value"].keys() == state["logger"]["name_to_excluded"].keys()
+
+
+def test_a_callback_that_cannot_be_saved_says_so_at_once(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    callback = HasNumbersOfNumpy()
+    model = tiny_pearl()
+    with pytest.raises(ValueError, match=r"The state_dict\(\) of HasNumbersOfNumpy cannot be saved"):
+        model.learn(2 * ROLLOUT, [callback, CheckpointCallback(1, str(tmp_path), companions=[callback])])
+    assert model.num_timesteps == 0
+
+
+def test_texts_of_the_monitor_go_on(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    def make() -> Any:
+        return DummyVecEnv([lambda: Monitor(InAKitchen(gym.make(ENV_ID)), info_keywords=("scene",))] * 4)
+
+    tiny_pearl(make()).learn(2 * ROLLOUT, CheckpointCallback(1, str(tmp_path)))
+    callback, model = CheckpointCallback(1, str(tmp_path)), tiny_pearl(make())
+    callback.restore(model, load_latest(tmp_path)[1])
+    assert {info["scene"] for info in model.ep_info_buffer or ()} == {"kitchen"}
+
+
+def test_a_training_goes_on_with_as_many_envs(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    tiny_pearl().learn(ROLLOUT, CheckpointCallback(1, str(tmp_path)))
+    callback, model = CheckpointCallback(1, str(tmp_path)), tiny_pearl(make_task_vec_env(ENV_ID, 2))
+    callback.restore(model, load_latest(tmp_path)[1])
+    with pytest.raises(ValueError, match="The training had 4 envs, and goes on with 2"):
+        model.learn(ROLLOUT, callback, reset_num_timesteps=False)
+
+
+def test_some_checkpoints_are_kept() -> None:
+    with pytest.raises(ValueError, match="keep is 0, expected a whole number of at least 1"):
+        CheckpointCallback(1, "run", keep=0)
