@@ -180,7 +180,6 @@ class CheckpointCallback(BaseCallback):
             self.model._num_timesteps_at_start = self._pending["num_timesteps_at_start"]
             self._pending = None
             return
-        self._callback_states()  # one that cannot be saved says so before any work is done
         beyond = [folder for folder in checkpoints(self.run) if _n_steps(folder) > self.num_timesteps]
         if beyond:
             raise ValueError(
@@ -198,6 +197,8 @@ class CheckpointCallback(BaseCallback):
         # A rollout begins with a reset of all envs, so nothing is lost by stopping just before it
         if self.n_calls - self._last_calls >= self.save_freq or self.stopping:
             self._save()
+        elif self.n_calls == 0:
+            self._callback_states()  # one that cannot be saved says so before any work is done
 
     def _save(self) -> None:
         folder = self.run / "checkpoints" / f"{self.num_timesteps}_steps"

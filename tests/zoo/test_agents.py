@@ -55,6 +55,29 @@ def test_agents_are_found_by_run_file_and_env(run: Path, tiny_pearl: MakePEARL, 
     assert agent_at(loose, env_id=ENV_ID).env_id == ENV_ID
 
 
+@pytest.mark.parametrize("more", [["--exp-id", "7"], ["--method", "rl2"]])
+def test_what_chooses_nothing_is_refused(run: Path, more: list[str]) -> None:
+    with pytest.raises(ValueError, match="says which agent, so --exp-id and --method choose nothing"):
+        main(["evaluate", str(run), *more])
+
+
+def test_what_a_killed_export_left_is_no_second_agent(run: Path, tmp_path: Path) -> None:
+    assert main(["export", str(run), "-o", str(tmp_path / "exported")]) == 0
+    (file,) = (tmp_path / "exported").glob("*.zip")
+    shutil.copy(file, file.with_name(".half.tmp.zip"))
+    assert agent_at(tmp_path / "exported").path == file
+
+
+def test_what_cannot_be_written_is_said_before_the_work(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def work(*args: Any, **kwargs: Any) -> None:
+        raise AssertionError("was begun")
+
+    monkeypatch.setattr("sb3_htr.zoo.commands.evaluate.record_adaptation", work)
+    (tmp_path / "file").touch()
+    with pytest.raises(FileExistsError):
+        main(["evaluate", str(run), "-o", str(tmp_path / "file")])
+
+
 def test_agents_that_are_not_there_are_said_to_be_so(tmp_path: Path, tiny_pearl: MakePEARL) -> None:
     (tmp_path / "text.zip").write_text("no model")
     tiny_pearl().save(tmp_path / "loose.zip")

@@ -75,6 +75,13 @@ def test_a_study_in_sqlite(quick: None, tmp_path: Path, capsys: pytest.CaptureFi
         assert list(trial.intermediate_values) == [1, 2] and trial.intermediate_values[2] == trial.value
 
 
+def test_a_study_is_of_one_env_and_one_method(quick: None, tmp_path: Path) -> None:
+    storage = f"sqlite:///{tmp_path}/study.db"
+    assert search(tmp_path, storage, n_trials=1) == 0
+    with pytest.raises(ValueError, match="The study 'test' searches with method of the YAML file, and not htr-ec: choose"):
+        search(tmp_path, storage, method="htr-ec")
+
+
 def test_a_study_in_a_journal(quick: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     check_search(tmp_path, f"{tmp_path}/journal/study.log", capsys, method="htr-ec")
 

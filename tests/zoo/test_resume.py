@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import shlex
 import shutil
 import signal
 import subprocess
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import load_results
 
 from helpers import ENV_ID
@@ -24,6 +26,7 @@ from sb3_htr.common.checkpoint import write_checkpoint
 from sb3_htr.common.resume import checkpoints
 from sb3_htr.common.versions import named
 from sb3_htr.zoo.cli import main
+from sb3_htr.zoo.run.manager import MetaExperimentManager
 from sb3_htr.zoo.run.shipped import hyperparams_file
 
 # Rollouts of 4 tasks x 3 episodes x 20 steps, 10 of them, a checkpoint after each
@@ -124,7 +127,8 @@ def test_training_further_is_as_if_it_had_been_planned(tmp_path: Path, capsys: p
     assert record["n_timesteps"] == record["hyperparams"]["n_timesteps"] == 960
     capsys.readouterr()
     assert main(["train", "--resume", str(run)]) == 0
-    assert f"{run} is finished, after 960 env steps. To train further: sb3-htr train --resume" in capsys.readouterr().out
+    output = capsys.readouterr().out
+    assert f"{run} is finished, after 960 env steps." in output and f"sb3-htr train --resume {run} -n 1" in output
 
 
 def test_a_learning_rate_decays_anew_when_training_further(tmp_path: Path) -> None:
@@ -346,3 +350,43 @@ def test_a_run_that_goes_on_with_other_code_says_so(unbroken: Path, tmp_path: Pa
     after = json.loads((again / "run.json").read_text())
     assert after == {**before, "resumed_by": [resumed]}
     assert named(after) == f"{named(before)}, then {named(record)}"
+
+
+class InterruptsOnce(BaseCallback):
+    """As Ctrl-C does, in the second rollout, unless it did so before."""
+
+    done = False
+
+    def _on_step(self) -> bool:
+        if not InterruptsOnce.done and self.num_timesteps > 300:
+            InterruptsOnce.done = True
+            raise KeyboardInterrupt
+        return True
+
+
+@pytest.mark.parametrize(
+    ("given", "trust"), [(["-n720"], False), (["-n", "720", "--eval-fre", "-1"], True), (["-n", "720"], True)]
+)
+def test_the_command_that_is_printed_to_go_on_is_taken(
+    given: list[str], trust: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A user may have said what a file, which may come from a stranger, may not."""
+    monkeypatch.setattr(InterruptsOnce, "done", False)
+    by_name = trust and "--eval-fre" not in given
+    if by_name:
+        settings = [f"callback:'{__name__}.InterruptsOnce'"]
+    else:
+        settings = []
+        learn = MetaExperimentManager.learn
+
+        def interrupted(manager: Any, model: Any) -> None:
+            manager.callbacks.append(InterruptsOnce())
+            learn(manager, model)
+
+        monkeypatch.setattr(MetaExperimentManager, "learn", interrupted)
+    few = ["train", "--env", ENV_ID, "-f", str(tmp_path), "--save-freq", "1", "--eval-freq", "-1", "--verbose", "0"]
+    assert main([*few, *given, "-params", *SMALL, *NETS, *settings]) == 0
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("To go on: "))
+    assert ("--trust" in line) == trust
+    assert main(shlex.split(line)[4:]) == 0
+    assert PEARL.load(run_folder(tmp_path) / f"{ENV_ID}.zip").num_timesteps == 720

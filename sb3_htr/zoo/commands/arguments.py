@@ -99,6 +99,11 @@ def chosen_agent(parser: argparse.ArgumentParser, args: argparse.Namespace, path
     """
     import_packages(args.gym_packages)
     if path is not None:
+        if args.exp_id or args.method:
+            raise ValueError(
+                f"{path} says which agent, so --exp-id and --method choose nothing: leave them out, or give -f FOLDER --env "
+                "ID in its place, where they choose among runs."
+            )
         agent = agent_at(path, args.model, args.env)
         if args.env not in (None, agent.env_id):
             raise ValueError(

@@ -45,13 +45,14 @@ def main(argv: Sequence[str]) -> None:
     family = get_task_family(env)
     tasks = task_set(family, args.tasks)
     explorer = args.explorer or model.explorer.name
-    record = record_adaptation(
-        model, env, tasks, args.n_episodes, explorer=explorer, deterministic=not args.stochastic, seed=args.seed
-    )
-    print(f"{agent.path}: adapting to {len(tasks)} {args.tasks} tasks of {agent.env_id}, explorer {explorer!r}")
-    print(table(record))
     output = args.output or agent.folder or Path(agent.stem)
+    # Around all, as what cannot be written should be known before the work
     with atomic_path(output / "adaptation.npz") as path:
+        record = record_adaptation(
+            model, env, tasks, args.n_episodes, explorer=explorer, deterministic=not args.stochastic, seed=args.seed
+        )
+        print(f"{agent.path}: adapting to {len(tasks)} {args.tasks} tasks of {agent.env_id}, explorer {explorer!r}")
+        print(table(record))
         about = {"model": str(agent.path), "env_id": agent.env_id, "explorer": explorer, "set": args.tasks, "seed": args.seed}
         np.savez_compressed(path, tasks=tasks, **record._asdict(), **about)
     pictures = [output / "adaptation_curve.png"]

@@ -105,7 +105,7 @@ def groups_of(parser: argparse.ArgumentParser, args: argparse.Namespace) -> dict
         raise ValueError(f"--labels needs one name of its own for each of the {len(args.agent)} folders, got {labels}.")
     groups: dict[str, list[TrainedAgent]] = {}
     for label, path in zip(labels, args.agent or [None], strict=True):
-        is_folder_of_runs = path is not None and path.is_dir() and not list(path.glob("*.zip"))
+        is_folder_of_runs = path is not None and path.is_dir() and not list(path.glob("[!.]*.zip"))
         paths = find_runs(path) if is_folder_of_runs else [path]
         groups[label] = [chosen_agent(parser, args, path) for path in paths]
         check_same_settings(label, groups[label])

@@ -83,7 +83,9 @@ def main(argv: Sequence[str]) -> None:
         planned = record["n_timesteps"] + further.n_timesteps
         # An interrupted training leaves a model, too, and so does one that goes on
         if (done := n_steps_done(run)) >= planned and n_steps_of(run / f"{file_stem(record['env_id'])}.zip") >= planned:
-            print(f"{run} is finished, after {done:,} env steps. To train further: sb3-htr train --resume {run} -n STEPS")
+            more = done - record["n_timesteps"] + 1
+            to_go_on = f"sb3-htr train --resume {run} -n {more}"
+            print(f"{run} is finished, after {done:,} env steps. To train further, by so many steps or more: {to_go_on}")
             return
         given = [*given_arguments(record["arguments"]), "--seed", str(record["seed"]), "-n", str(planned)]
         check_arguments(given, record["gym_packages"], run / RECORD, args.trust, args.gym_packages)

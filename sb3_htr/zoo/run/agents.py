@@ -226,7 +226,7 @@ def agent_at(
     :raises ValueError: if it is no model file, or one that does not say its env
     """
     path = Path(path)
-    files = list(path.glob("*.zip"))
+    files = list(path.glob("[!.]*.zip"))  # hidden ones are what a killed process left
     if len(files) == 1 and not any(path.rglob(RECORD)):
         path = files[0]
     if path.is_dir():

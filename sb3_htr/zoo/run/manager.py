@@ -46,12 +46,13 @@ from sb3_htr.pearl.policies import PEARLPolicy
 from sb3_htr.pearl.untrusted import load_untrusted
 from sb3_htr.zoo.run.agents import RECORD, read_record
 from sb3_htr.zoo.run.algorithm import Algorithm
+from sb3_htr.zoo.run.arguments import given_arguments
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback, ProgressCallback
 from sb3_htr.zoo.run.folder import claim, lock
 from sb3_htr.zoo.run.method import DEFAULT, PEARLMethod, get_method, merged, names_of
 from sb3_htr.zoo.run.search_space import convert_pearl_params, sample_pearl_params
 from sb3_htr.zoo.run.shipped import find_hyperparams
-from sb3_htr.zoo.run.trust import PACKAGES, plain_settings, refuse
+from sb3_htr.zoo.run.trust import PACKAGES, check_arguments, plain_settings, refuse
 
 # What a YAML file may have beside the arguments of the algorithm
 ZOO_SETTINGS = ("n_envs", "n_timesteps", "env_wrapper", "vec_env_wrapper", "callback", "env_kwargs")
@@ -99,6 +100,7 @@ class MetaExperimentManager(ExperimentManager):
         if self.optimize_hyperparameters and not isinstance(self.method, PEARLMethod):
             raise ValueError(f"The search is for settings of PEARL, and {self.method.name} has none: choose another --method.")
         checked = partial(plain_settings, trust=self.trust, named=self.args.gym_packages)
+        self._go_on_with = given
         hyperparams = self.method.settings(checked(hyperparams, self.config))
         if self.resumed is not None:  # what a user gave comes from a file now
             given = checked(given, self.resumed / RECORD)
@@ -267,7 +269,14 @@ class MetaExperimentManager(ExperimentManager):
     def _to_go_on(self) -> str:
         packages = [name for name in self.args.gym_packages if name not in PACKAGES]
         named = ["--gym-packages", *packages] if packages else []
-        return shlex.join(["sb3-htr", "train", "--resume", self.save_path, *named, *["--trust"] * self.trust])
+        record = read_record(Path(self.save_path) / RECORD)
+        trust = self.trust
+        try:
+            check_arguments(given_arguments(record["arguments"]), record["gym_packages"], RECORD, trust, packages)
+            plain_settings(self._go_on_with, RECORD, trust, packages)
+        except ValueError:  # what a user may say, the record may not
+            trust = True
+        return shlex.join(["sb3-htr", "train", "--resume", self.save_path, *named, *["--trust"] * trust])
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
         if self.trust:

@@ -114,10 +114,15 @@ def check_env_kwargs(env_kwargs: Any, file: object, trust: bool, named: Iterable
 
 
 def _one_by_one(arguments: Sequence[str]) -> Iterator[str]:
-    """``--option=value`` as two words."""
+    """``--option=value`` and ``-nVALUE`` as two words."""
     for word in arguments:
         option, equals, value = word.partition("=")
-        yield from (option, value) if equals and option.startswith("--") else (word,)
+        if equals and option.startswith("--"):
+            yield from (option, value)
+        elif word[:2] in ("-n", "-f") and word not in HARMLESS:
+            yield from (word[:2], word[2:])
+        else:
+            yield word
 
 
 def _is_literal(text: str) -> bool:
