@@ -181,12 +181,18 @@ def draw_goal_sets(source: GoalEnvSource, n_train: int, n_validation: int, n_tes
     :param n_test: how many test goals.
     :param task_seed: seed of all three; each has a source of randomness of its own.
     :return: the goals; must not be written to.
-    :raises ValueError: if the env has too few goals, or its reward is not sparse.
+    :raises ValueError: if the env has too few goals, draws others for the same seed, or its reward is not sparse.
     """
     if min(n_train, n_validation, n_test) < 1:
         raise ValueError(
             f"n_train_tasks, n_validation_tasks, n_test_tasks are {n_train}, {n_validation}, {n_test}: each must be at least "
             "1."
+        )
+    first, _, again = (draw_goal(source, seed) for seed in (0, 1, 0))
+    if not np.array_equal(first, again):
+        raise ValueError(
+            f"{source.spec.id} draws another goal for the same seed, so that each process would have other tasks: let its "
+            "reset draw from self.np_random."
         )
     seen: dict[bytes, FloatArray] = {}
     for purpose, n in enumerate((n_train, n_validation, n_test)):

@@ -492,7 +492,7 @@ def test_only_the_envs_of_a_model_can_be_adapted_to(tiny_pearl: MakePEARL) -> No
     goal_env.observation_space = spaces.Dict(observation=spaces.Box(-1, 1, (2,)))
     with pytest.raises(ValueError, match=r"spaces do not match.*concatenate observation and achieved_goal"):
         model.adapt(goal_env)
-    for agent in (model, RL2("MlpLstmPolicy", ENV_ID), ScriptedAgent.random(spaces.Box(-2, 2, (2,)))):
+    for agent in (model, RL2("MlpLstmPolicy", ENV_ID), ScriptedAgent(spaces.Box(-2, 2, (2,)))):
         other = ENV_ID if isinstance(agent, ScriptedAgent) else "SparseTargetSpeed-v0"
         with pytest.raises(ValueError, match="spaces do not match"):
             evaluate_adaptation(agent, other, n_episodes=1)
@@ -683,3 +683,39 @@ def test_a_wrapper_that_changes_observations_is_refused_in_the_first_rollout(wra
     env = FlattenObservation(wrap(TransformObservation(gym.make(ENV_ID), lambda obs: obs, BOUNDED)))
     with pytest.raises(ValueError, match="a wrapper changes observations, and hindsight rewards would be wrong"):
         tiny_pearl(env, n_tasks_per_rollout=1).learn(1)
+
+
+@pytest.mark.parametrize("seed", [-1, 2**32, None, 0.5])
+def test_seeds_that_some_generator_would_not_take(tiny_pearl: MakePEARL, seed: Any) -> None:
+    model = tiny_pearl()
+    for call in (model.adapt, partial(evaluate_adaptation, model)):
+        with pytest.raises(ValueError, match=r"seed is .*, expected a whole number"):
+            call(ENV_ID, n_episodes=1, seed=seed)
+    if seed is not None:
+        with pytest.raises(ValueError, match=r"seed is .*, expected a whole number"):
+            tiny_pearl(seed=seed)
+    assert tiny_pearl(seed=np.int64(3)).seed == 3
+
+
+def test_a_longer_time_limit_needs_other_room(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl().learn(ROLLOUT)
+    with pytest.raises(ValueError, match="time limit is 40 steps, and what was collected has room for episodes of 20"):
+        model.set_env(make_task_vec_env(ENV_ID, 4, env_kwargs={"max_episode_steps": 40}))
+
+
+def test_an_entropy_coefficient_of_another_kind_than_the_files(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    for theirs, ours in (("auto", 0.01), (0.01, "auto")):
+        tiny_pearl(ent_coef=theirs).save(tmp_path / "model")
+        with pytest.raises(ValueError, match=f"ent_coef is {ours!r}, and that of the file is of the other kind"):
+            PEARL.load(tmp_path / "model", env=make_task_vec_env(ENV_ID, 4), ent_coef=ours)
+
+
+def test_a_step_of_all_envs_tells_of_each(tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch) -> None:
+    env = make_task_vec_env(ENV_ID, 4)
+    env.reset()
+    vector_env = env.unwrapped.vector_env  # type: ignore[attr-defined]
+    monkeypatch.setattr(
+        vector_env, "_step_state", lambda actions: (np.zeros((4, 2), dtype=np.float32), 0.0, np.zeros(4, bool))
+    )
+    with pytest.raises(ValueError, match=r"expected arrays of shape \(4,\), got \(\) and \(4,\)"):
+        env.step(np.zeros((4, 2), dtype=np.float32))

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.loop import Adapts, Watched, adaptation_steps
 from sb3_htr.common.checks import check_is_env, get_max_episode_steps, get_task_family
-from sb3_htr.common.random_state import seeded_actions
+from sb3_htr.common.random_state import MAX_SEED, seeded_actions
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.type_aliases import TaskFamily
 from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env, reset_to_tasks
@@ -165,6 +165,7 @@ def record_adaptation(
             f"{type(model).__name__} does not adapt: pass the model of meta-training, or evaluate an adapted agent by "
             "stable_baselines3's evaluate_policy."
         )
+    check_numbers(seed=(seed, 0, MAX_SEED))
     n_tasks = N_ENVS if tasks is None or isinstance(tasks, str) else np.shape(tasks)[0] if np.ndim(tasks) else 1
     if isinstance(env, str):
         env = make_task_vec_env(env, max(n_tasks, 1), seed)

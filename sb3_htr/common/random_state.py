@@ -9,6 +9,9 @@ from typing import Any
 import numpy as np
 import torch as th
 
+# The largest that all generators take
+MAX_SEED = 2**32 - 1
+
 
 def get_generator_state(generator: np.random.Generator) -> str:
     """

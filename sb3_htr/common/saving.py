@@ -41,7 +41,15 @@ class CheckedFiles(BaseAlgorithm):
             kwargs["_stats_window_size"] = kwargs.pop("stats_window_size")
         if str(path).endswith(".pt"):
             raise ValueError(f"{path} is no model: an agent that is adapted to a task is loaded by AdaptedAgent.load.")
-        return super().load(path, env, *args, **kwargs)
+        try:
+            return super().load(path, env, *args, **kwargs)
+        except (KeyError, AttributeError) as error:
+            if "ent_coef" not in kwargs:
+                raise
+            raise ValueError(
+                f"ent_coef is {kwargs['ent_coef']!r}, and that of the file is of the other kind, a number or learnt ('auto'), "
+                "which the rest of the file depends on: leave it out, or train anew."
+            ) from error
 
     def _setup_model(self) -> None:
         self._check_policy_class()

@@ -162,7 +162,20 @@ class CopiedWrapper(VecEnvWrapper):
 
 
 class TaskVecMonitor(CopiedWrapper, VecMonitor):
-    """SB3's monitor. A deep copy writes no file."""
+    """SB3's monitor. A deep copy writes no file, and envs have seeds that no other run has."""
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """
+        Of SB3's envs, number i has the seed ``seed + i``, so that runs and evaluations of consecutive seeds would share all of
+        them but one. Here only the first one has a seed that others could have, its own.
+
+        :param seed: of the first env
+        :return: seeds of all
+        """
+        seeds = self.venv.seed(seed)
+        env = self.venv.unwrapped
+        env._seeds = [seeds[0], *np.random.SeedSequence(seeds[0]).generate_state(self.num_envs)[1:].tolist()]
+        return env._seeds
 
     def step_wait(self) -> VecEnvStepReturn:
         try:

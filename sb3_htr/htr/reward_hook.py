@@ -32,7 +32,7 @@ def check_reward_hook(
     task = np.repeat([task for task, _ in episodes], [len(episode) for _, episode in episodes])
     tasks = family.train_tasks[task]
     traj = columns.trajectory(rows[:, None])
-    given, computed = rows[:, columns.reward], family.compute_reward(traj, tasks)[:, 0]
+    given, computed = rows[:, columns.reward], np.asarray(family.compute_reward(traj, tasks))[:, 0]
     solved = family.is_success(traj, tasks)[:, 0]
     wrong = ~np.isclose(given, computed, rtol=1e-4, atol=1e-4)
     if wrong.any():

@@ -32,7 +32,7 @@ from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.callback import followed_by
 from sb3_htr.common.latent_policy import Obs, State
 from sb3_htr.common.progress import MetaProgressBarCallback
-from sb3_htr.common.random_state import get_generator_state, seeded_actions, set_generator_state
+from sb3_htr.common.random_state import MAX_SEED, get_generator_state, seeded_actions, set_generator_state
 from sb3_htr.common.saving import CheckedFiles, with_suffix
 from sb3_htr.common.settings import check_keywords, check_numbers
 from sb3_htr.common.training_state import Resumable
@@ -101,6 +101,9 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
     ) -> None:
         checks.check_device(kwargs.get("device", "auto"))
         check_numbers(n_tasks_per_rollout=(n_tasks_per_rollout, 1))
+        if seed is not None:
+            check_numbers(seed=(seed, 0, MAX_SEED))
+            seed = int(seed)  # numpy's are no seeds for Python's own generator
         self.explorer, self.train_explorer = to_explorer(explorer), to_explorer(train_explorer)
         buffer_class = replay_buffer_class or MultiTaskReplayBuffer
         check_keywords("replay_buffer_kwargs", replay_buffer_kwargs or {}, buffer_class)
@@ -228,13 +231,19 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         """
         :param env: env of the same spaces and number of copies; its task family replaces the old one if nothing was collected
         :param force_reset: reset before training goes on
-        :raises ValueError: if there is experience of another task family, or something changes the env's rewards
+        :raises ValueError: if there is experience of another task family or of shorter episodes, or something changes the
+            env's rewards
         """
         vec_env = self._wrap_env(env)
         checks.check_rewards(vec_env)
         if self.replay_buffer is not None and self.replay_buffer.size() > 0:
             known = checks.family_facts(self.replay_buffer.task_family)
             checks.check_same_family(known, checks.family_facts(checks.get_task_family(vec_env)), "The env")
+            if (n_steps := checks.get_max_episode_steps(vec_env)) > self.replay_buffer.max_episode_steps:
+                raise ValueError(
+                    f"The env's time limit is {n_steps} steps, and what was collected has room for episodes of "
+                    f"{self.replay_buffer.max_episode_steps}: load the model on this env, without its experience."
+                )
         super().set_env(vec_env, force_reset)
         if self.replay_buffer is None or self.replay_buffer.size() == 0:
             self._setup_replay(vec_env)
@@ -432,7 +441,8 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         :return: chooses z and takes in what happens
         :raises ValueError: if the explorer goes by successes, and the model was trained on a family without
         """
-        chosen = self.explorer if explorer in (None, self.explorer.name) else to_explorer(explorer)
+        own = to_explorer(self.explorer)
+        chosen = own if explorer in (None, own.name) else to_explorer(explorer)
         self._check_explorer(chosen)
         check_numbers(n_envs=(n_envs, 1))
         return Adaptation(
@@ -472,8 +482,8 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
             env does not say so (``info["is_success"]``), whether a reward was told from what is task-free
         :raises ValueError: for several envs, an env with other spaces, a task that the env does not have, episodes without end
         """
-        check_numbers(n_episodes=(n_episodes, 1))
-        vec_env = self._wrap_env(make_task_vec_env(env) if isinstance(env, str) else env, monitor_wrapper=False)
+        check_numbers(n_episodes=(n_episodes, 1), seed=(seed, 0, MAX_SEED))
+        vec_env = self._wrap_env(gym.make(env) if isinstance(env, str) else env, monitor_wrapper=False)
         if vec_env.num_envs != 1:
             raise ValueError(f"adapt() adapts to one task, but the VecEnv has {vec_env.num_envs} envs: pass a single env.")
         self.check_env(vec_env)

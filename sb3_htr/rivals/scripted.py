@@ -20,24 +20,15 @@ class ScriptedAgent:
     Is evaluated as a trained one is, by :func:`sb3_htr.evaluate_adaptation`.
 
     :param action_space: Box
-    :param script: observations (n, obs_dim) and the tasks to solve (n, task_dim) to actions (n, action_dim), scaled to [-1, 1]
+    :param script: observations (n, obs_dim) and the tasks to solve (n, task_dim) to actions (n, action_dim), scaled to
+        [-1, 1]; by default, actions are uniformly random, whatever the task
     """
 
     explorer = OwnWay()
 
-    def __init__(self, action_space: spaces.Box, script: Script) -> None:
+    def __init__(self, action_space: spaces.Box, script: Script | None = None) -> None:
         self.action_space = action_space
         self.script = script
-
-    @classmethod
-    def random(cls, action_space: spaces.Box, seed: int = 0) -> "ScriptedAgent":
-        """
-        :param action_space: Box
-        :param seed: of the actions
-        :return: an agent whose actions are uniformly random, whatever the task
-        """
-        rng, shape = np.random.default_rng(seed), action_space.shape
-        return cls(action_space, lambda obs, tasks: rng.uniform(-1, 1, (len(obs), *shape)).astype(np.float32))
 
     @property
     def policy(self) -> "ScriptedAgent":
@@ -62,7 +53,13 @@ class ScriptedAgent:
         """
         :param n_envs: number of tasks
         :param explorer: None or ``"own"``: a script explores in no other way
-        :param generator: not used
+        :param generator: source of random actions; torch's global one by default
         :return: acts by the script
         """
-        return ToldAdaptation(n_envs, lambda obs, tasks, deterministic: self.script(obs, tasks))
+
+        def act(obs: np.ndarray, tasks: np.ndarray, deterministic: bool) -> np.ndarray:
+            if self.script is not None:
+                return self.script(obs, tasks)
+            return np.asarray(2 * th.rand((len(obs), *self.action_space.shape), generator=generator).numpy() - 1)
+
+        return ToldAdaptation(n_envs, act)

@@ -8,7 +8,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from stable_baselines3.common.vec_env import SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from helpers import ENV_ID
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
@@ -55,3 +55,15 @@ def test_ctrl_c_leaves_envs_in_processes_to_the_training() -> None:
     env.step(np.zeros((1, 2), dtype=np.float32))
     env.close()
     assert all(process.exitcode == 0 for process in processes)
+
+
+def test_runs_of_consecutive_seeds_share_no_env() -> None:
+    """By SB3, number i has the seed ``seed + i``."""
+    draws = []
+    for seed in (0, 1):
+        env, again = (make_task_vec_env(ENV_ID, 5, seed=seed, vec_env_class=DummyVecEnv) for _ in range(2))
+        env.reset(), again.reset()
+        of_run, of_repetition = ([rng.integers(2**31) for rng in e.get_attr("np_random")] for e in (env, again))
+        assert of_run == of_repetition
+        draws += of_run
+    assert len(set(draws)) == 10

@@ -105,6 +105,15 @@ class InformedEnv(ReachEnv):
         return np.array([one["reward"] for one in info])
 
 
+class UnseededEnv(ReachEnv):
+    """Its goals are drawn from numpy's global generator."""
+
+    def reset(self, **kwargs: Any) -> Any:
+        super().reset(**kwargs)
+        self.goal = np.random.uniform(-1.0, 1.0, 2)
+        return self._observe(), {}
+
+
 class PlainEnv(ReachEnv):
     """Not a GoalEnv."""
 
@@ -122,7 +131,7 @@ class DiscreteEnv(ReachEnv):
 
 
 _class: Any
-for _class in (ReachEnv, ChoiceEnv, CostlyEnv, InformedEnv, PlainEnv, DiscreteEnv):
+for _class in (ReachEnv, ChoiceEnv, CostlyEnv, InformedEnv, UnseededEnv, PlainEnv, DiscreteEnv):
     gym.register(f"Toy{_class.__name__}-v0", entry_point=_class, max_episode_steps=30)
 TOY, CHOICE = "ToyReachEnv-v0", "ToyChoiceEnv-v0"
 
@@ -272,6 +281,7 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     (CHOICE, {"reward_type": "free"}, "gives 0 ..., but a sparse reward"),
     (CHOICE, {"reward_type": "one goal at a time"}, "let it take many goals at once, as HER does"),
     (TOY, {"n_goals": 9}, "drew only 9 different goals"),
+    ("ToyUnseededEnv-v0", {}, "draws another goal for the same seed"),
     ("ToyCostlyEnv-v0", {}, "must depend on achieved and desired goal alone"),
     ("ToyInformedEnv-v0", {}, "raised KeyError('reward') for goals of shape (n, goal_dim)"),
     ("ToyPlainEnv-v0", {}, "ToyPlainEnv-v0 is no GoalEnv"),
