@@ -66,7 +66,10 @@ def load_latest(run: Path) -> tuple[Path, dict[str, Any]]:
             return folder, read_checkpoint(folder)
         except DamagedCheckpoint as error:
             warnings.warn(f"{error} The next older checkpoint is tried.", stacklevel=2)
-    raise FileNotFoundError(f"There is no checkpoint to go on from in {run / 'checkpoints'}: train again, with --save-freq.")
+    raise FileNotFoundError(
+        f"There is no checkpoint to go on from in {run / 'checkpoints'}: train again, with --save-freq, and in an experiment "
+        f"remove {run} before."
+    )
 
 
 def cut_monitor_files(run: Path, folder: Path, sizes: dict[str, int]) -> None:

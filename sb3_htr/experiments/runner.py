@@ -2,17 +2,18 @@
 
 import json
 import platform
-from itertools import pairwise, takewhile
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from filelock import FileLock, Timeout
 
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.common.resume import checkpoints
+from sb3_htr.common.resume import checkpoints, n_steps_done
 from sb3_htr.common.versions import commit, named, processor
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.log import logged
@@ -22,6 +23,7 @@ from sb3_htr.zoo.run.agents import RECORD, agent_at, file_stem, find_runs, n_ste
 from sb3_htr.zoo.run.algorithm import Model
 from sb3_htr.zoo.run.arguments import ALWAYS
 from sb3_htr.zoo.run.learned import seconds_at
+from sb3_htr.zoo.run.method import get_method, merged
 from sb3_htr.zoo.run.trust import import_packages
 
 # Means over the training of what HTR paper, B.2 reasons with
@@ -34,7 +36,7 @@ def claim(cell: Cell, runs: Path) -> FileLock:
     :param runs: folder of all experiments' runs
     :return: what a process has as long as it runs the cell; the system takes it back when the process ends, however it does
     """
-    return FileLock(cell.run_folder(runs) / ".claim")
+    return FileLock(cell.run_folder(runs) / ".claim", fallback_to_soft=False)
 
 
 def machine() -> str:
@@ -126,21 +128,31 @@ def find_finished(cell: Cell, folder: Path) -> tuple[Path, Model] | None:
                     f"{run} has {key} {record[key]!r}, but {cell.experiment}/{cell.name} needs {getattr(cell, key)!r}: "
                     f"move this run away, or choose other --runs."
                 )
-        has, needs = (_settings(arguments) for arguments in (record["arguments"], cell.training(folder)))
-        if has != needs:
+        has, needs = (_settings(*of) for of in ((record["hyperparams"], record["arguments"]), _planned(cell, folder)))
+        if different := sorted(key for key in {*has, *needs} if has.get(key) != needs.get(key)):
+            key = different[0]
             raise ValueError(
-                f"{run} has the settings {sorted(has)}, but {cell.experiment}/{cell.name} needs {sorted(needs)}: move this "
-                "run away, or choose other --runs."
+                f"{run} has {key} {has.get(key)!r}, but {cell.experiment}/{cell.name} needs {needs.get(key)!r}, as the YAML "
+                "file or the experiment says: move this run away, or choose other --runs."
             )
-        # An interrupted training leaves a model, too
-        if n_steps_of(run / f"{file_stem(cell.env_id)}.zip") >= cell.n_timesteps:
+        # An interrupted training leaves a model, too; and of a finished one, the checkpoints may have been removed
+        model, last = run / f"{file_stem(cell.env_id)}.zip", n_steps_done(run)
+        if n_steps_of(model) >= cell.n_timesteps and (last >= cell.n_timesteps or not last):
             return run, agent_at(run, "last").load()
     return None
 
 
-def _settings(arguments: list[str]) -> set[str]:
-    """Of the arguments of a training: hyperparameters, and what its evaluations are."""
-    after = arguments[arguments.index("-params") + 1 :] if "-params" in arguments else []
+def _planned(cell: Cell, folder: Path) -> tuple[dict[str, Any], list[str]]:
+    """Hyperparameters and arguments of the training of a cell, as its record will have them."""
+    method = get_method(cell.method)
+    blocks = yaml.safe_load(Path(method.algorithm.settings_file).read_text())
+    of_env = {key: value for key, value in blocks.get(cell.env_id, blocks["default"]).items() if key != "method"}
+    used = {**merged(method.settings(of_env), cell.settings), "n_timesteps": cell.n_timesteps}
+    return json.loads(json.dumps(used, default=str)), cell.training(folder)
+
+
+def _settings(hyperparams: dict[str, Any], arguments: list[str]) -> dict[str, Any]:
+    """What a training is: hyperparameters, evaluations, and whether it began with the weights of another."""
     options = {**ALWAYS, **dict(pairwise(arguments))}
-    evaluations = {f"{option} {options.get(option)}" for option in ("--eval-episodes", "--eval-freq")}
-    return {*takewhile(lambda word: not word.startswith("-"), after), *evaluations}
+    chosen = {option: options.get(option) for option in ("--eval-episodes", "--eval-freq")}
+    return {**hyperparams, **chosen, "-i": options.get("-i", options.get("--trained-agent"))}

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from helpers import ENV_ID
 from sb3_htr import PEARL, evaluate_adaptation, make_task_vec_env
@@ -21,6 +22,7 @@ from sb3_htr.experiments.runner import find_finished, run_cell
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.commands import train
 from sb3_htr.zoo.run.agents import agent_at
+from sb3_htr.zoo.run.shipped import hyperparams_file
 
 SMALL: dict[str, Any] = {
     "n_envs": 4,
@@ -75,7 +77,7 @@ def test_a_killed_run_goes_on_and_a_finished_one_is_tested(tmp_path: Path, monke
     assert (again["returns_prior"] == raw["returns_prior"]).all() and "returns_belief" not in again
     with pytest.raises(ValueError, match="seed 1, but other/tiny-n_test_tasks10-seed2 needs 2: move this run away"):
         find_finished(replace(others, seed=2), folder)
-    with pytest.raises(ValueError, match=r"has the settings .*'batch_size:4'.* needs .*'batch_size:5'"):
+    with pytest.raises(ValueError, match=r"has batch_size 4, but .* needs 5"):
         find_finished(replace(others, settings={**SMALL, "batch_size": 5}), folder)
     assert find_finished(replace(others, n_timesteps=1200), tmp_path / "nowhere") is None
 
@@ -123,10 +125,30 @@ def test_results_of_other_settings_are_not_taken_for_those_of_a_cell(tmp_path: P
         with pytest.raises(ValueError, match="move it away with its run"):
             run_cell(other, tmp_path)
     cell.result(tmp_path).unlink()
-    with pytest.raises(ValueError, match=r"has the settings .*'--eval-episodes 2'.* needs .*'--eval-episodes 3'"):
+    with pytest.raises(ValueError, match=r"has --eval-episodes '2', but .* needs '3'"):
         find_finished(replace(cell, n_episodes=3), cell.run_folder(tmp_path))
-    with pytest.raises(ValueError, match=r"'--eval-freq 480'.* needs .*'--eval-freq 240'"):
+    with pytest.raises(ValueError, match=r"has --eval-freq '480', but .* needs '240'"):
         find_finished(replace(cell, eval_freq=240), cell.run_folder(tmp_path))
+
+
+def test_a_run_by_another_file_of_settings_is_not_that_of_a_cell(tmp_path: Path) -> None:
+    (cell,) = Experiment("one", "", ENV_ID, 480, (Variant("htr-ser", "tiny", SMALL),), 1, 480, by(("prior",))).cells()
+    blocks = yaml.safe_load(hyperparams_file("pearl.yml").read_text())
+    (tmp_path / "mine.yml").write_text(yaml.safe_dump({"default": {**blocks["default"], "kl_coef": 7.0}}))
+    assert main([*["train", *cell.training(cell.run_folder(tmp_path))], "-conf", str(tmp_path / "mine.yml")]) == 0
+    with pytest.raises(ValueError, match=r"has kl_coef 7\.0, but one/tiny-seed1 needs None, as the YAML file"):
+        run_cell(cell, tmp_path)
+
+
+def test_a_training_that_was_interrupted_in_its_last_updates_is_not_finished(tmp_path: Path) -> None:
+    """It leaves a model of as many env steps as were planned."""
+    (cell,) = Experiment("one", "", ENV_ID, 480, (Variant("htr-ser", "tiny", SMALL),), 1, 480, by(("prior",))).cells()
+    folder = cell.run_folder(tmp_path)
+    assert main(["train", *cell.training(folder)]) == 0
+    run, _ = find_finished(cell, folder) or pytest.fail("there is one")
+    (last,) = checkpoints(run)
+    last.rename(last.with_name("240_steps"))
+    assert find_finished(cell, folder) is None
 
 
 def test_explorers_and_episodes_are_those_of_the_experiment(tmp_path: Path) -> None:

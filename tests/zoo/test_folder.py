@@ -1,5 +1,7 @@
 """A run folder has one owner, however many processes begin at once."""
 
+import errno
+import fcntl
 import multiprocessing
 import subprocess
 import sys
@@ -87,3 +89,14 @@ def test_a_run_has_its_owner_until_its_last_model_is_written(tmp_path: Path, mon
     monkeypatch.setattr(ExperimentManager, "save_trained_model", save)
     assert main(train_arguments(Path("runs"), 240)) == 0
     lock(saved[0]).release()
+
+
+def test_without_locks_of_the_system_nothing_is_owned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A marker in their place would outlive a process that is killed on another node."""
+
+    def flock(*args: Any) -> None:
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with pytest.raises((OSError, NotImplementedError)):
+        lock(tmp_path)

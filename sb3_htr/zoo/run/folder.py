@@ -43,7 +43,8 @@ def lock(folder: Path) -> FileLock:
     :return: to be kept as long as the run is trained; the end of the process releases it, too
     :raises ValueError: if another process trains it
     """
-    owner = FileLock(folder / LOCK)
+    # Without locks of the system, a marker would outlive a killed process
+    owner = FileLock(folder / LOCK, fallback_to_soft=False)
     try:
         owner.acquire(timeout=0)
     except Timeout:
