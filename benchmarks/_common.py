@@ -20,7 +20,7 @@ from sb3_htr import PEARL
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.common.versions import commit, named, processor
-from sb3_htr.zoo.run.memory import keep_freed_memory
+from sb3_htr.zoo.run.malloc import keep_freed_memory
 
 # As sb3-htr train does
 keep_freed_memory()

@@ -11,8 +11,7 @@ from typing import Any
 
 from tables import fill
 
-from sb3_htr.adaptation.evaluation import record_adaptation
-from sb3_htr.adaptation.first_success import first_success
+from sb3_htr.adaptation.evaluation import first_success, record_adaptation
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.zoo.run.agents import agent_at
 from sb3_htr.zoo.run.method import methods

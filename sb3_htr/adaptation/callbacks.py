@@ -9,9 +9,8 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import EvalCallback
 
-from sb3_htr.adaptation.evaluation import MetaLearner, record_adaptation, task_set
+from sb3_htr.adaptation.evaluation import MetaLearner, first_success, record_adaptation, task_set
 from sb3_htr.adaptation.explorers import to_explorer
-from sb3_htr.adaptation.first_success import first_success
 from sb3_htr.common.atomic import WRITE_ERRORS, atomic_path, reason
 from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.settings import check_numbers

@@ -10,7 +10,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_htr.adaptation.loop import Adapts, Watched, adaptation_steps
+from sb3_htr.adaptation.loop import Adapting, adaptation_steps
 from sb3_htr.common.checks import check_is_env, get_max_episode_steps, get_task_family
 from sb3_htr.common.random_state import MAX_SEED, seeded_actions
 from sb3_htr.common.settings import check_numbers
@@ -19,15 +19,6 @@ from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env, reset_to_tasks
 
 #: Sets of tasks that a family has
 TASK_SETS = ("test", "validation", "train")
-
-
-class Named(Protocol):
-    """Something with a name, as explorers have."""
-
-    @property
-    def name(self) -> str:
-        """In tables and pictures."""
-        ...
 
 
 class MetaLearner(Protocol):
@@ -39,15 +30,15 @@ class MetaLearner(Protocol):
         ...
 
     @property
-    def explorer(self) -> Named:
-        """How it explores unless told otherwise."""
+    def explorer(self) -> Any:
+        """How it explores unless told otherwise; it has a ``name``."""
         ...
 
     def check_env(self, env: VecEnv) -> None:
         """Refuse an env that it cannot act in."""
         ...
 
-    def start_adaptation(self, n_envs: int, explorer: Any = None, generator: th.Generator | None = None) -> Watched:
+    def start_adaptation(self, n_envs: int, explorer: Any = None, generator: th.Generator | None = None) -> Adapting:
         """Begin to adapt to one task per env."""
         ...
 
@@ -68,10 +59,18 @@ class AdaptationRecord(NamedTuple):
     achieved: np.ndarray
 
 
+def first_success(successes: np.ndarray) -> np.ndarray:
+    """
+    :param successes: (..., n_episodes) bool, whether each adaptation episode solved its task
+    :return: (...) int, number of the first that did, from 1 on; one more than there are where none did
+    """
+    return np.where(successes.any(axis=-1), successes.argmax(axis=-1) + 1, successes.shape[-1] + 1)
+
+
 def run_adaptation(
     policy: BasePolicy,
     env: VecEnv,
-    adaptation: Adapts,
+    adaptation: Adapting,
     obs: np.ndarray,
     n_episodes: int,
     deterministic: bool = True,

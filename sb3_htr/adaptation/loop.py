@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_htr.adaptation.adaptation import Step
 
 
-class Adapts(Protocol):
+class Adapting(Protocol):
     """An adaptation in progress, such as :class:`sb3_htr.adaptation.Adaptation`."""
 
     def act(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
@@ -19,10 +19,6 @@ class Adapts(Protocol):
     def observe(self, step: Step) -> None:
         """Take in one step of each env."""
         ...
-
-
-class Watched(Adapts, Protocol):
-    """An adaptation that tells whoever watches it where it stands."""
 
     def exploring(self) -> np.ndarray:
         """(n_envs,) bool, whether nothing is known about the task yet but what was tried in vain."""
@@ -44,7 +40,7 @@ class SeesTasks(Protocol):
 
 def adaptation_steps(
     env: VecEnv,
-    adaptation: Adapts,
+    adaptation: Adapting,
     n_episodes: int,
     unscale_action: Callable[[np.ndarray], np.ndarray],
     act: Callable[[np.ndarray], np.ndarray],

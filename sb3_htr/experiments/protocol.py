@@ -5,9 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from sb3_htr.adaptation.evaluation import evaluate_adaptation
+from sb3_htr.adaptation.evaluation import evaluate_adaptation, first_success
 from sb3_htr.adaptation.explorers import Explorer, Prior, to_explorer
-from sb3_htr.adaptation.first_success import first_success
 from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.experiments.ablations import ABLATIONS

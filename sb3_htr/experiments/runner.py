@@ -21,9 +21,9 @@ from sb3_htr.experiments.protocol import evaluate
 from sb3_htr.zoo.commands import train
 from sb3_htr.zoo.run.agents import RECORD, agent_at, file_stem, find_runs, n_steps_of, read_record
 from sb3_htr.zoo.run.algorithm import Model
-from sb3_htr.zoo.run.arguments import ALWAYS
-from sb3_htr.zoo.run.learned import seconds_at
+from sb3_htr.zoo.run.defaults import ALWAYS
 from sb3_htr.zoo.run.method import get_method, merged
+from sb3_htr.zoo.run.time_to_learned import seconds_at
 from sb3_htr.zoo.run.trust import import_packages
 
 # Means over the training of what HTR paper, B.2 reasons with

@@ -13,7 +13,7 @@ from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.adaptation import Step
-from sb3_htr.adaptation.loop import Watched
+from sb3_htr.adaptation.loop import Adapting
 from sb3_htr.common.callback import followed_by
 from sb3_htr.common.checks import check_has_env, check_is_not_normalized
 from sb3_htr.common.saving import CheckedFiles
@@ -116,10 +116,10 @@ class Rival(CheckedFiles, Resumable):
     explorer = OwnWay()
 
     @abstractmethod
-    def _adaptation(self, n_envs: int, generator: th.Generator | None) -> Watched:
+    def _adaptation(self, n_envs: int, generator: th.Generator | None) -> Adapting:
         """An adaptation to so many tasks, side by side."""
 
-    def start_adaptation(self, n_envs: int, explorer: Any = None, generator: th.Generator | None = None) -> Watched:
+    def start_adaptation(self, n_envs: int, explorer: Any = None, generator: th.Generator | None = None) -> Adapting:
         """
         :param n_envs: number of tasks to adapt to side by side
         :param explorer: None or ``"own"``: it explores in its own way

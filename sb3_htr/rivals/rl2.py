@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.adaptation import Step
-from sb3_htr.adaptation.loop import Watched
+from sb3_htr.adaptation.loop import Adapting
 from sb3_htr.common.checks import check_is_env
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.vec_env import N_ENVS, in_float32, make_task_vec_env
@@ -152,5 +152,5 @@ class RL2(Rival, RecurrentPPO):
         """
         super().dump_logs(self.num_timesteps // (self.n_steps * self.n_envs))
 
-    def _adaptation(self, n_envs: int, generator: th.Generator | None) -> Watched:
+    def _adaptation(self, n_envs: int, generator: th.Generator | None) -> Adapting:
         return TrialAdaptation(self.policy, n_envs, self.n_episodes_per_trial)

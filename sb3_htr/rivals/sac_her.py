@@ -15,7 +15,7 @@ from stable_baselines3.her import HerReplayBuffer
 from stable_baselines3.sac import SAC
 from stable_baselines3.sac.policies import MultiInputPolicy, SACPolicy
 
-from sb3_htr.adaptation.loop import Watched
+from sb3_htr.adaptation.loop import Adapting
 from sb3_htr.common.checks import check_is_env, check_same_family, family_facts, get_max_episode_steps, get_task_family
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.type_aliases import Trajectory
@@ -196,7 +196,7 @@ class SACHER(Rival, SAC):
         assert isinstance(self.replay_buffer, TaskHerReplayBuffer)
         self.replay_buffer.load_state_dict(state["replay"])
 
-    def _adaptation(self, n_envs: int, generator: th.Generator | None) -> Watched:
+    def _adaptation(self, n_envs: int, generator: th.Generator | None) -> Adapting:
         def act(obs: np.ndarray, tasks: np.ndarray, deterministic: bool) -> np.ndarray:
             actions, _ = self.policy.predict(self.shown(obs, tasks), deterministic=deterministic)
             return self.policy.scale_action(actions)

@@ -9,12 +9,14 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from helpers import ENV_ID
 from sb3_htr.adaptation import Step
 from sb3_htr.adaptation.loop import adaptation_steps
+from sb3_htr.rivals.base import RivalAdaptation
 
 
-class Noting:
+class Noting(RivalAdaptation):
     """Acts at random, and notes what it is told."""
 
     def __init__(self) -> None:
+        super().__init__(n_envs=2)
         self.steps: list[Step] = []
         self.rng = np.random.default_rng(0)
 

@@ -12,9 +12,9 @@ import gymnasium as gym
 from htr_envs.goal_env import find_hidden
 from sb3_htr.common.resume import n_steps_done
 from sb3_htr.zoo.run.agents import OF_TRAINING, RECORD, file_stem, find_run, n_steps_of, read_record
-from sb3_htr.zoo.run.arguments import default_arguments, given_arguments
+from sb3_htr.zoo.run.defaults import default_arguments, given_arguments
+from sb3_htr.zoo.run.malloc import keep_freed_memory
 from sb3_htr.zoo.run.manager import run_rl_zoo
-from sb3_htr.zoo.run.memory import keep_freed_memory
 from sb3_htr.zoo.run.method import DEFAULT, get_method, methods
 from sb3_htr.zoo.run.trust import CONF, check_arguments, import_packages, see_working_folder
 

@@ -8,8 +8,7 @@ import numpy as np
 from matplotlib.patches import Circle
 
 from htr_envs import Trajectory
-from sb3_htr.adaptation.evaluation import AdaptationRecord
-from sb3_htr.adaptation.first_success import first_success
+from sb3_htr.adaptation.evaluation import AdaptationRecord, first_success
 from sb3_htr.zoo.plots.style import BLUE, GREEN, GREY, ORANGE, save, span_unit_if_flat
 
 # Tasks in a picture of paths, evenly taken from all of them

@@ -46,8 +46,8 @@ from sb3_htr.pearl.policies import PEARLPolicy
 from sb3_htr.pearl.untrusted import load_untrusted
 from sb3_htr.zoo.run.agents import RECORD, read_record
 from sb3_htr.zoo.run.algorithm import Algorithm
-from sb3_htr.zoo.run.arguments import given_arguments
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback, ProgressCallback
+from sb3_htr.zoo.run.defaults import given_arguments
 from sb3_htr.zoo.run.folder import claim, lock
 from sb3_htr.zoo.run.method import DEFAULT, PEARLMethod, get_method, merged, names_of
 from sb3_htr.zoo.run.search_space import convert_pearl_params, sample_pearl_params

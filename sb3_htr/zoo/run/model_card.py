@@ -8,7 +8,7 @@ from huggingface_hub import EvalResult, ModelCardData
 
 from sb3_htr.adaptation.evaluation import AdaptationRecord
 from sb3_htr.zoo.run.algorithm import Algorithm
-from sb3_htr.zoo.run.arguments import given_arguments
+from sb3_htr.zoo.run.defaults import given_arguments
 from sb3_htr.zoo.run.hub import model_name
 from sb3_htr.zoo.run.method import DEFAULT, get_method, methods
 from sb3_htr.zoo.run.trust import PACKAGES

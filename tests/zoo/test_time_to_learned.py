@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_htr.zoo.run.learned import time_to_learned
+from sb3_htr.zoo.run.time_to_learned import time_to_learned
 
 N_TASKS, N_EPISODES = 3, 2
 
