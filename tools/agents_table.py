@@ -87,7 +87,8 @@ def table(scores: dict[str, dict[str, Any]]) -> str:
         if not measured:
             lines.append(f"| `{name}` | {record['num_timesteps']:,} | | not measured by this version | | |")
         commands.append(record["command"])
-    return "\n".join(lines) + "\n\nThey were made by\n\n" + "".join(f"    {command}\n" for command in commands) + "\n"
+    made = "Earlier code made them (targets of one step; its commit is not in the files), by"
+    return "\n".join(lines) + f"\n\n{made}\n\n" + "".join(f"    {command}\n" for command in commands) + "\n"
 
 
 def main() -> None:
