@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import importlib
+import sys
 from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib.metadata import version
@@ -49,9 +50,11 @@ class GoalEnvSource:
         """
         spec = copy.deepcopy(_find_spec(env_id) if isinstance(env_id, str) else env_id)
         spec.kwargs.update(env_kwargs)
-        arguments = ", ".join(f"{key}={value!r}" for key, value in sorted(spec.kwargs.items()))
+        with np.printoptions(threshold=sys.maxsize, floatmode="unique"):  # arrays in full, as they tell sources apart
+            arguments = ", ".join(f"{key}={value!r}" for key, value in sorted(spec.kwargs.items()))
         return cls(f"{spec.id}({arguments})", spec, spec.entry_point)
 
+    @lru_cache(maxsize=16)  # noqa: B019 sources are few; a copy may have objects of another address, and be another source
     def dense(self) -> GoalEnvSource | None:
         """The same env with its dense reward, None where it has no argument ``reward_type``."""
         return self.find(self.spec, {"reward_type": "dense"}) if "reward_type" in self.spec.kwargs else None

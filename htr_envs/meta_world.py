@@ -43,6 +43,7 @@ class MetaWorldGoalEnv(gym.Env[dict[str, DoubleArray], NDArray[np.float32]]):
         self._task, self.render_mode = task, render_mode
         make: Any = ALL_V3_ENVIRONMENTS[f"{task}-v3"]
         self._env = make(render_mode=render_mode, camera_name=CAMERA)
+        self._env.max_path_length = np.inf  # the time limit is a wrapper's
         # what its set_task does, but for freezing the positions
         self._env._set_task_called, self._env._freeze_rand_vec, self._env.seeded_rand_vec = True, False, True
         sizes = {"observation": N_FRAMES, "achieved_goal": 3, "desired_goal": 3}

@@ -59,7 +59,7 @@ class Canvas:
     def circle(self, center: ArrayLike, radius: float, width: float, colour: Colour, upper_half: bool = False) -> None:
         """Draw the outline of a circle, or of its upper half."""
         box = self._box(center, radius + width / 2 * self.pixel)
-        self._draw.arc(box, *((180, 360) if upper_half else (0, 360)), fill=colour, width=round(SCALE * width))
+        self._draw.arc(box, *((180, 360) if upper_half else (0, 360)), fill=colour, width=max(round(SCALE * width), 1))
 
     def line(self, points: ArrayLike, width: float, colour: Colour) -> None:
         """Draw straight lines from point to point, (n, 2)."""

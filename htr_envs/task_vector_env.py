@@ -161,7 +161,7 @@ class TaskVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]], ABC):
                 "_step_state returns observations, task-free rewards and terminations, one of each for each env: expected "
                 f"arrays of shape ({self.num_envs},), got {np.shape(task_free_reward)} and {np.shape(terminated)}."
             )
-        task_free_reward, terminated = np.asarray(task_free_reward), np.asarray(terminated)
+        task_free_reward, terminated = np.asarray(task_free_reward), np.asarray(terminated, dtype=np.bool_)
         final_obs = np.array(states, dtype=np.float32)
         # an axis of T = 1 makes every copy a trajectory of its own, with its own task
         traj = Trajectory(*(values[:, None] for values in (self._observations, actions, final_obs, task_free_reward)))

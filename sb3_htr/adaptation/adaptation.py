@@ -12,6 +12,9 @@ from sb3_htr.common.task_reward import task_reward
 from sb3_htr.common.type_aliases import Context
 from sb3_htr.htr.episode_store import evenly_spread
 
+# Of observations, actions and rewards: networks see float32, of which larger ones have no squares
+LARGEST = 1e18
+
 
 class Step(NamedTuple):
     """
@@ -144,11 +147,12 @@ class Adaptation:
             width = "" if n_axes == 1 else " action_dim" if name == "actions" else " obs_dim"
             expected = f"({self.n_envs},{width})"
             raise ValueError(f"The {name} have shape {shape}, expected {expected}, a row for each env.")
-        if not np.isfinite(values).all():
-            env = int((~np.isfinite(values)).reshape(self.n_envs, -1).any(axis=1).argmax())
+        usual = np.abs(values) <= LARGEST  # which nothing is that is NaN
+        if not usual.all():
+            env = int((~usual).reshape(self.n_envs, -1).any(axis=1).argmax())
             raise ValueError(
-                f"The {name} of env {env} are {values[env]}, expected finite numbers: they would be taken for "
-                "evidence. Begin a new Adaptation once the env is mended."
+                f"The {name} of env {env} are {values[env]}, expected finite numbers up to {LARGEST:g}: they would be taken "
+                "for evidence. Begin a new Adaptation once the env is mended."
             )
 
     @staticmethod
@@ -166,7 +170,7 @@ class Adaptation:
         beside = step.rewards - task_free.cpu().numpy()
         self.largest_reward = np.maximum(self.largest_reward, beside)
         if self._watch is not None:
-            self._watch.check(beside, np.asarray(step.dones))
+            self._watch.check(beside, np.asarray(step.dones, dtype=bool))
         return np.where(beside > self.knowledge.threshold.item(), beside, 0.0)
 
     def _remember(self, *columns: np.ndarray) -> None:

@@ -18,8 +18,8 @@ MAX_TRAIN_TASKS = 128
 MAX_HINDSIGHT_TASKS, MAX_NEWCOMERS = 256, 32
 # Steps of each new episode that may become hindsight tasks
 N_CANDIDATES = 8
-# Episodes rewarded under all tasks at a time, to bound memory
-CHUNK = 128
+# Episodes rewarded under all tasks at a time, and steps of them, to bound memory
+CHUNK, CHUNK_STEPS = 128, 12_800
 # What is saved
 ARRAYS = ("tasks", "best_return", "length", "likelihood", "episodes")
 
@@ -93,8 +93,9 @@ class TaskBank:
         new, self.new = [episode for _, episode in self.new], []
         if missing_hook(self.task_family) is not None:
             return
-        for start in range(0, len(new), CHUNK):
-            chunk = new[start : start + CHUNK]
+        size = max(min(CHUNK, CHUNK_STEPS // max(map(len, new), default=1)), 1)
+        for start in range(0, len(new), size):
+            chunk = new[start : start + size]
             length = np.array([len(episode) for episode in chunk])
             episodes = np.stack([np.pad(episode, ((0, length.max() - len(episode)), (0, 0))) for episode in chunk])
             self._pack(episodes, length)

@@ -2,6 +2,7 @@
 
 import hashlib
 import re
+import sys
 import warnings
 from typing import Any
 
@@ -165,8 +166,9 @@ def family_facts(family: TaskFamily) -> dict[str, str]:
     def fact(value: Any) -> str:
         if isinstance(value, np.ndarray):
             return f"array of shape {value.shape}, {hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()[:12]}"
-        # An object that does not say what it is names its address
-        return re.sub(r" at 0x[0-9a-f]+", "", repr(value))
+        with np.printoptions(threshold=sys.maxsize, floatmode="unique"):
+            # An object that does not say what it is names its address
+            return re.sub(r" at 0x[0-9a-f]+", "", repr(value))
 
     attributes = getattr(family, "__dict__", {})
     return {"class": type(family).__qualname__, **{name: fact(value) for name, value in sorted(attributes.items())}}

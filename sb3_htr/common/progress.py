@@ -17,6 +17,7 @@ class MetaProgressBarCallback(ProgressBarCallback):
         # Share of an iteration's time that its updates take, and what is left of the rollout's steps for them
         self._share = 0.0
         self._credit = 0.0
+        self._per_update = 0.0
         self._n_updates = 0
         self._rollout_start = self._rollout_end = 0.0
 

@@ -122,12 +122,12 @@ def _policy_kwargs(given: dict[str, Any]) -> dict[str, Any]:
     known = {"latent_dim", "net_arch", "encoder_arch", "normalize_observations"}
     if given.get("encoder_class") in list(ENCODERS):
         known.add("encoder_class")
-    unknown = [name for name in given if name not in known]
-    if any(not name.startswith(":") for name in unknown):
+    unknown = [name for name in given if name not in known and not name.startswith(":")]  # SB3 marks some
+    if unknown:
         raise Refused(
             f"its policy has the setting {unknown[0]!r}, which only PEARL.load restores, and that may run code of the file."
         )
-    kwargs = {name: value for name, value in given.items() if name not in unknown}
+    kwargs = {name: value for name, value in given.items() if name in known and value is not None}
     for units in (kwargs.get("net_arch", []), kwargs.get("encoder_arch", []), [kwargs.get("latent_dim", 1)]):
         if len(units) > MAX_LAYERS or not all(type(unit) is int and 1 <= unit <= MAX_UNITS for unit in units):
             raise Refused(f"PEARL's networks do not have layers of {units} units.")

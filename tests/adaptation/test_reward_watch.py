@@ -5,11 +5,13 @@ import warnings
 from collections.abc import Callable
 
 import gymnasium as gym
+import numpy as np
 import pytest
 
 from helpers import ENV_ID
 from helpers.runs import SHIPPED
 from sb3_htr import PEARL
+from sb3_htr.adaptation import Step
 
 
 @pytest.mark.parametrize(
@@ -30,3 +32,17 @@ def test_rewards_unlike_those_of_training_are_warned_of(given: Callable[[float],
         PEARL.load(SHIPPED).adapt(env, n_episodes=8)
     about = [text for text in (str(warning.message) for warning in caught) if "meta-training" in text]
     assert len([text for text in about if re.search(message, text)]) == (1 if message else 0)
+
+
+def test_ends_of_episodes_may_be_numbers() -> None:
+    adaptation = PEARL.load(SHIPPED).start_adaptation(3)
+    obs = np.zeros((3, 2), dtype=np.float32)
+    with pytest.warns(UserWarning, match="On average, the steps of an episode returned -1"):
+        adaptation.observe(Step(obs, obs, np.array([0.0, 0.0, -1.0]), obs, np.array([0, 0, 1])))
+
+
+def test_rewards_that_no_network_could_take_are_refused() -> None:
+    adaptation = PEARL.load(SHIPPED).start_adaptation(1)
+    obs = np.zeros((1, 2), dtype=np.float32)
+    with pytest.raises(ValueError, match=r"The rewards of env 0 are 1e\+30, expected finite numbers up to 1e\+18"):
+        adaptation.observe(Step(obs, obs, np.array([1e30]), obs, np.array([False])))

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from helpers import MakePEARL
+from helpers import ROLLOUT, MakePEARL
 from sb3_htr.common import progress
 from sb3_htr.common.progress import MetaProgressBarCallback
 
@@ -74,3 +74,15 @@ def test_progress_is_as_even_as_time(
         if 0.25 * end < now < 0.9 * end:
             assert now / n * 8 * 240 - now == pytest.approx(end - now, rel=0.2), (now, n)
     assert max(later - before for (before, _), (later, _) in pairwise(bar.shown)) <= max(of_step, of_update) + 1e-9
+
+
+def test_a_training_after_one_that_was_interrupted_in_its_first_rollout(tiny_pearl: MakePEARL) -> None:
+    """As in a notebook: SB3 does not end the bar then."""
+
+    def interrupt(local: dict[str, Any], _: Any) -> bool:
+        raise KeyboardInterrupt
+
+    model = tiny_pearl()
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(ROLLOUT, callback=interrupt, progress_bar=True)
+    assert model.learn(ROLLOUT).num_timesteps == ROLLOUT

@@ -22,6 +22,7 @@ from helpers.drawing import skip_where_mujoco_cannot_draw
 from htr_envs import HiddenGoalEnv, HiddenGoalFamily, Trajectory, check_task_env, goal_env_source, hide_goal
 from htr_envs.goal_env import find_hidden
 from sb3_htr import PEARL, evaluate_adaptation
+from sb3_htr.common.checks import family_facts
 from sb3_htr.common.vec_env import make_task_vec_env
 
 PAGE = Path(__file__).parents[2] / "docs" / "envs" / "hidden_goal.md"
@@ -114,6 +115,19 @@ class UnseededEnv(ReachEnv):
         return self._observe(), {}
 
 
+class ListEnv(ReachEnv):
+    """Its goals are given to it."""
+
+    def __init__(self, goals: Any) -> None:
+        super().__init__()
+        self.goals = goals
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.goal = np.asarray(self.goals[self.np_random.integers(len(self.goals))], dtype=np.float64)
+        return self._observe(), {}
+
+
 class PlainEnv(ReachEnv):
     """Not a GoalEnv."""
 
@@ -131,7 +145,7 @@ class DiscreteEnv(ReachEnv):
 
 
 _class: Any
-for _class in (ReachEnv, ChoiceEnv, CostlyEnv, InformedEnv, UnseededEnv, PlainEnv, DiscreteEnv):
+for _class in (ReachEnv, ChoiceEnv, CostlyEnv, InformedEnv, UnseededEnv, ListEnv, PlainEnv, DiscreteEnv):
     gym.register(f"Toy{_class.__name__}-v0", entry_point=_class, max_episode_steps=30)
 TOY, CHOICE = "ToyReachEnv-v0", "ToyChoiceEnv-v0"
 
@@ -151,6 +165,17 @@ def test_an_id_that_is_registered_again_is_another_family() -> None:
 
     near, far = (register(radius).reached([0.0, 0.0], [0.2, 0.0]) for radius in (0.1, 0.3))
     assert not near and far
+
+
+def test_families_of_long_arguments_are_told_apart() -> None:
+    """numpy leaves out most of an array of more than a thousand numbers."""
+    near = np.random.default_rng(0).uniform(-1, 1, (600, 2))
+    far = near.copy()
+    far[100:500] += 5
+    sizes = {"n_train_tasks": 40, "n_validation_tasks": 2, "n_test_tasks": 2}
+    families = [HiddenGoalFamily("ToyListEnv-v0", {"goals": goals}, **sizes) for goals in (near, far)]
+    assert families[0].train_tasks.max() < 1.1 < families[1].train_tasks.max()
+    assert family_facts(families[0]) != family_facts(families[1])
 
 
 def make(env_id: str, **kwargs: Any) -> tuple[gym.Env[Any, Any], HiddenGoalEnv]:

@@ -301,3 +301,12 @@ def test_a_file_is_loaded_as_what_it_is_and_with_settings_that_are_known(tiny_pe
             rival.load(tmp_path / "model")
     with pytest.raises(ValueError, match=f"The env is the id '{ENV_ID}', expected an env: make it with"):
         PEARL.load(tmp_path / "model", env=ENV_ID)
+
+
+def test_networks_of_default_sizes_are_read_without_trust(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    tiny_pearl(policy_kwargs={"net_arch": None, "encoder_arch": None, "latent_dim": 3}).save(tmp_path / "model")
+    env = make_task_vec_env(ENV_ID, 4)
+    assert load_untrusted(tmp_path / "model", env).policy.latent_dim == 3
+    tiny_pearl(policy_kwargs={"activation_fn": th.nn.Tanh}).save(tmp_path / "tanh")
+    with pytest.raises(ValueError, match="has the setting 'activation_fn', which only"):
+        load_untrusted(tmp_path / "tanh", env)

@@ -127,6 +127,8 @@ def test_record_makes_a_film(suffix: str, tmp_path: Path, capsys: pytest.Capture
 def test_films_that_cannot_be_made(tmp_path: Path, tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match=r"the suffix '.avi', expected one of .mp4, .gif"):
         main(["record", *NOWHERE, "-o", "film.avi"])
+    with pytest.raises(ValueError, match=r"no more than 50 of a gif: add --every 4, or write an .mp4"):
+        main(["record", *NOWHERE, "-o", "film.gif", "--speed", "20"])
     with pytest.raises(ValueError, match="--every is 0"):
         main(["record", *NOWHERE, "--every", "0"])
     monkeypatch.setattr("sb3_htr.zoo.show.film.MAX_GIF_FRAMES", 5)
@@ -155,6 +157,14 @@ def test_captions_know_what_was_worst(tmp_path: Path) -> None:
     first = captioner(frame, Moment(1, 3, 0, (0.0,), (False,), True, 0.5, False, frame))
     last = captioner(frame, Moment(1, 3, 9, (0.0, -2.0, 5.0), (False, False, True), False, 0.05, True, frame))
     assert first.shape == last.shape and first.shape[0] % 2 == first.shape[1] % 2 == 0
-    assert (first[:101, :201] == 0).all(), "the frame itself is not touched"
-    dark = [(picture[101:] < 60).all(axis=-1).sum() for picture in (first, last)]
+    assert (first[:202, :402] == 0).all(), "the frame itself is not touched, but enlarged to have room for words"
+    dark = [(picture[202:] < 60).all(axis=-1).sum() for picture in (first, last)]
     assert dark[1] < dark[0], "the bar of the uncertainty is shorter"
+
+
+@pytest.mark.parametrize(("side", "n_episodes"), [(16, 20), (400, 300)])
+def test_captions_of_small_frames_and_many_episodes(side: int, n_episodes: int) -> None:
+    frame = np.zeros((side, side, 3), dtype=np.uint8)
+    done = (1.0,) * n_episodes
+    picture = Captioner()(frame, Moment(1, n_episodes, 9, done, (True,) * n_episodes, False, 0.1, True, frame))
+    assert picture.shape[1] >= 300

@@ -1,5 +1,6 @@
 """``sb3-htr record``: film a trained agent that adapts."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from sb3_htr.common.atomic import atomic_path
 from sb3_htr.zoo.commands.arguments import add_agent_arguments, make_parser, parse
 from sb3_htr.zoo.commands.enjoy import add_task_arguments, can_be_drawn, watch
 from sb3_htr.zoo.show.captions import Captioner
-from sb3_htr.zoo.show.film import SUFFIXES, Film
+from sb3_htr.zoo.show.film import MAX_GIF_FPS, SUFFIXES, Film
 from sb3_htr.zoo.show.play import Moment
 
 EXAMPLE = """  sb3-htr record --env SparsePointRobot-v0                       SparsePointRobot-v0.mp4
@@ -50,6 +51,12 @@ def main(argv: Sequence[str]) -> None:
     if not can_be_drawn(agent):
         raise ValueError(f"{agent.env_id} cannot be filmed: 'rgb_array' is not in its metadata['render_modes'].")
     fps = agent.make_env().metadata.get("render_fps", 30) * args.speed / args.every
+    if output.suffix == ".gif" and fps > MAX_GIF_FPS:
+        every = math.ceil(args.every * fps / MAX_GIF_FPS)
+        raise ValueError(
+            f"The film would have {fps:.0f} frames a second, and players show no more than {MAX_GIF_FPS} of a gif: add "
+            f"--every {every}, or write an .mp4."
+        )
     captioner = Captioner()
     with atomic_path(output) as temporary:
         film = Film(temporary, fps)

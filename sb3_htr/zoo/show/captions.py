@@ -9,6 +9,8 @@ from sb3_htr.zoo.show.play import Moment
 INK, PALE, SOLVED, MISSED = "#222222", "#dddddd", "#0072B2", "#E69F00"
 # In units of the font size
 LINE, MARGIN, COLUMN = 1.5, 0.7, 10.7
+# Of frames in pixels, to have room for words; smaller ones are enlarged
+MIN_WIDTH = 300
 
 
 class Captioner:
@@ -31,6 +33,8 @@ class Captioner:
         if moment.episode == 1 and moment.step == 0:
             self._deviation = moment.deviation
         self.top_return = max(self.top_return, *moment.returns)
+        if (enlarged := -(-MIN_WIDTH // frame.shape[1])) > 1:
+            frame = frame.repeat(enlarged, axis=0).repeat(enlarged, axis=1)
         height, width = frame.shape[:2]
         size = max(width // 28, 9)
         panel = int(size * (3 * LINE + 2 * MARGIN + 0.5))
@@ -72,7 +76,8 @@ class Captioner:
         pitch = (right - left) / moment.n_episodes
         floor = top + height
         for i in range(moment.n_episodes):
-            x0, x1 = left + i * pitch + 1, left + (i + 1) * pitch - 2
+            x0 = left + i * pitch + 1
+            x1 = max(left + (i + 1) * pitch - 2, x0)
             draw.line([(x0, floor), (x1, floor)], fill=PALE, width=2)
             if i < moment.episode:
                 colour = SOLVED if moment.successes[i] else MISSED

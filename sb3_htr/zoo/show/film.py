@@ -9,6 +9,8 @@ from PIL import Image
 
 SUFFIXES = (".mp4", ".gif")
 MAX_GIF_FRAMES = 1500
+# Of a gif, browsers show frames of 10 ms and less ten times as long
+MAX_GIF_FPS = 50
 
 
 class Film:
