@@ -187,3 +187,9 @@ def test_one_cell_of_a_job_array_writes_no_tables(tmp_path: Path, monkeypatch: p
     assert ran == [("htr-ser-seed2", tmp_path / "here")] and not Path("results").exists()
     with pytest.raises(ValueError, match="--cell is 2, expected 0 to 1"):
         main(["experiment", "pair", "--cell", "2"])
+
+
+def test_runs_in_an_object_store_are_refused() -> None:
+    """A local folder of that name would be on one node alone."""
+    with pytest.raises(ValueError, match="expected a folder: object stores have to be mounted"):
+        main(["experiment", "point_robot", "--quick", "--runs", "s3://bucket/runs"])
