@@ -67,8 +67,7 @@ def load_latest(run: Path) -> tuple[Path, dict[str, Any]]:
         except DamagedCheckpoint as error:
             warnings.warn(f"{error} The next older checkpoint is tried.", stacklevel=2)
     raise FileNotFoundError(
-        f"There is no checkpoint to go on from in {run / 'checkpoints'}: train again, with --save-freq, and in an experiment "
-        f"remove {run} before."
+        f"There is no checkpoint to go on from in {run / 'checkpoints'}: move {run} away, and train again, with --save-freq."
     )
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import yaml
-from filelock import FileLock, Timeout
+from filelock import Timeout
 
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr.common.arrays import load_arrays
@@ -22,6 +22,7 @@ from sb3_htr.zoo.commands import train
 from sb3_htr.zoo.run.agents import RECORD, agent_at, file_stem, find_runs, n_steps_of, read_record
 from sb3_htr.zoo.run.algorithm import Model
 from sb3_htr.zoo.run.defaults import ALWAYS
+from sb3_htr.zoo.run.folder import SystemLock
 from sb3_htr.zoo.run.method import get_method, merged
 from sb3_htr.zoo.run.time_to_learned import seconds_at
 from sb3_htr.zoo.run.trust import import_packages
@@ -30,13 +31,13 @@ from sb3_htr.zoo.run.trust import import_packages
 LOGGED = ("relabelled_fraction", "rl_reward_mean", "rl_zero_reward_fraction")
 
 
-def claim(cell: Cell, runs: Path) -> FileLock:
+def claim(cell: Cell, runs: Path) -> SystemLock:
     """
     :param cell: of an experiment
     :param runs: folder of all experiments' runs
     :return: what a process has as long as it runs the cell; the system takes it back when the process ends, however it does
     """
-    return FileLock(cell.run_folder(runs) / ".claim", fallback_to_soft=False)
+    return SystemLock(cell.run_folder(runs) / ".claim")
 
 
 def machine() -> str:

@@ -150,6 +150,14 @@ def test_a_plain_env_without_task_family_and_infos_is_adapted_to_as_well(tiny_pe
         model.adapt(Plain(goal), task=3)
 
 
+@pytest.mark.filterwarnings("ignore:No reward was found")
+def test_an_id_of_an_env_without_tasks_will_do(tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch) -> None:
+    made_by: Any = Plain
+    spec = gym.envs.registration.EnvSpec("Plain-v0", made_by, kwargs={"goal": np.array([9.0, 9.0], dtype=np.float32)})
+    monkeypatch.setitem(gym.registry, "Plain-v0", spec)
+    assert not tiny_pearl().adapt("Plain-v0", 2).successes.any()
+
+
 class SaysOne(Plain):
     """Many a GoalEnv has numbers as ``is_success``."""
 

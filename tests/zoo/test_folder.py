@@ -5,6 +5,7 @@ import fcntl
 import multiprocessing
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -98,5 +99,6 @@ def test_without_locks_of_the_system_nothing_is_owned(tmp_path: Path, monkeypatc
         raise OSError(errno.ENOSYS, "Function not implemented")
 
     monkeypatch.setattr(fcntl, "flock", flock)
-    with pytest.raises((OSError, NotImplementedError)):
+    with pytest.raises((OSError, NotImplementedError)), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
         lock(tmp_path)

@@ -43,8 +43,8 @@ def main(argv: Sequence[str]) -> None:
     args = parser.parse_args(argv)
     given = {"--seeds": args.seeds, "--jobs": args.jobs}
     check_numbers(**{name: (n, 1) for name, n in given.items() if n is not None})
-    if "://" in (url := str(args.runs)) or ":/" in url:
-        raise ValueError(f"--runs is {url}, expected a folder: object stores have to be mounted.")
+    if ":/" in str(args.runs):
+        raise ValueError(f"--runs is {args.runs}, expected a folder: object stores have to be mounted.")
     experiment = grid.EXPERIMENTS[args.name]
     cells = experiment.cells(1, 0.1) if args.quick else experiment.cells(args.seeds)
     cells = [replace(cell, gym_packages=tuple(packages)) for cell in cells]

@@ -1,9 +1,11 @@
 """The folder of a run: it has one owner."""
 
+import errno
 import os
 from pathlib import Path
+from typing import Any
 
-from filelock import FileLock, Timeout
+from filelock import FileLock, SoftFileLock, Timeout
 
 LOCK = ".lock"
 
@@ -37,14 +39,31 @@ def claim(log_folder: str, stem: str, suffix: str) -> Path:
         return folder
 
 
-def lock(folder: Path) -> FileLock:
+class SystemLock(FileLock):
+    """A file lock that the operating system takes back when its process ends, however it does."""
+
+    def acquire(self, *args: Any, **kwargs: Any) -> Any:
+        """
+        :param args: of filelock's
+        :param kwargs: likewise
+        :return: what filelock's returns
+        :raises OSError: if the file system has no locks. filelock then becomes one that leaves a marker in a file, which would
+            outlive a process that is killed on another node
+        """
+        acquired = super().acquire(*args, **kwargs)
+        if isinstance(self, SoftFileLock):
+            self.release()
+            raise OSError(errno.ENOSYS, "The file system has no locks: mount it with flock", self.lock_file)
+        return acquired
+
+
+def lock(folder: Path) -> SystemLock:
     """
     :param folder: of a run
     :return: to be kept as long as the run is trained; the end of the process releases it, too
     :raises ValueError: if another process trains it
     """
-    # Without locks of the system, a marker would outlive a killed process
-    owner = FileLock(folder / LOCK, fallback_to_soft=False)
+    owner = SystemLock(folder / LOCK)
     try:
         owner.acquire(timeout=0)
     except Timeout:

@@ -100,11 +100,10 @@ class MetaExperimentManager(ExperimentManager):
         if self.optimize_hyperparameters and not isinstance(self.method, PEARLMethod):
             raise ValueError(f"The search is for settings of PEARL, and {self.method.name} has none: choose another --method.")
         checked = partial(plain_settings, trust=self.trust, named=self.args.gym_packages)
-        self._go_on_with = given
         hyperparams = self.method.settings(checked(hyperparams, self.config))
         if self.resumed is not None:  # what a user gave comes from a file now
             given = checked(given, self.resumed / RECORD)
-        self._given = names_of(given)
+        self._given = given
         hyperparams = merged(merged(hyperparams, checked(self._trial(trial_id), self.storage)), given)
         if self.n_timesteps > 0:
             hyperparams["n_timesteps"] = self.n_timesteps
@@ -273,7 +272,7 @@ class MetaExperimentManager(ExperimentManager):
         trust = self.trust
         try:
             check_arguments(given_arguments(record["arguments"]), record["gym_packages"], RECORD, trust, packages)
-            plain_settings(self._go_on_with, RECORD, trust, packages)
+            plain_settings(self._given, RECORD, trust, packages)
         except ValueError:  # what a user may say, the record may not
             trust = True
         return shlex.join(["sb3-htr", "train", "--resume", self.save_path, *named, *["--trust"] * trust])
@@ -321,7 +320,7 @@ class MetaExperimentManager(ExperimentManager):
             how = (
                 self.method.relabel_probability > 0,
                 "hindsight_task_strategy" in self.method.relabeller_settings(),
-                self._given,
+                names_of(self._given),
             )
             HYPERPARAMS_SAMPLER[self.algo] = lambda trial, *_: merged(self._hyperparams, sample_pearl_params(trial, *how))
             return super().objective(trial)
