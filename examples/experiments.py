@@ -5,19 +5,21 @@
     sb3-htr experiment sparse_half_cheetah_velocity --gym-packages examples.experiments
     sb3-htr experiment ant_goal_disc --gym-packages examples.experiments
     sb3-htr experiment half_cheetah_velocity --gym-packages examples.experiments
+    sb3-htr experiment dense_context --gym-packages examples.experiments
 
 All settings are the defaults, but for the ant's entropy coefficient, which is that of SparseAnt-v0, and for
-half_cheetah_velocity, whose rewards are dense: it has PEARL's own.
+half_cheetah_velocity and dense_context, whose rewards are dense: they have PEARL's own protocol.
 """
 
 from examples import (  # noqa: F401 register the envs
     ant_goal_disc,
+    dense_point_robot,
     half_cheetah_velocity,
     hidden_target_reacher,
     sparse_half_cheetah_velocity,
     two_link_arm,
 )
-from sb3_htr.experiments.grid import BELIEF, EXPERIMENTS, Experiment, Variant, by
+from sb3_htr.experiments.grid import BELIEF, EXPERIMENTS, TUNED_DENSE, Experiment, Variant, by
 
 HTR = (Variant("htr-ser"),)
 RIVALS = (*HTR, Variant("htr-hfr"), Variant("htr-hipi"))
@@ -50,4 +52,16 @@ EXPERIMENTS["half_cheetah_velocity"] = Experiment(
     eval_freq=100_000,
     evaluations=by(("prior",)),
     n_episodes=3,
+)
+
+# With the settings that were searched for the dense proxy, and its budget. One episode of the prior: its rewards tell the goal
+FIRST = {"name": "prior", "n_exploration_episodes": 1}
+EXPERIMENTS["dense_context"] = Experiment(
+    "dense_context",
+    "PEARL whose contexts have the dense proxy reward too, in training and at meta-test.",
+    "DensePointRobot-v0",
+    450_000,
+    (Variant("pearl-sparse-prior", "pearl, dense context", {**TUNED_DENSE, "explorer": FIRST, "train_explorer": FIRST}),),
+    eval_freq=50_000,
+    evaluations=by(("prior",)),
 )

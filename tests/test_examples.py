@@ -26,7 +26,8 @@ FAMILIES = {
 }
 
 
-DEPENDENT = {"half_cheetah_velocity": "HalfCheetahVelocity-v0", "walker_random_params": "WalkerRandomParams-v0"}
+DENSE = {"half_cheetah_velocity": "HalfCheetahVelocity-v0", "dense_point_robot": "DensePointRobot-v0"}
+DEPENDENT = {**DENSE, "walker_random_params": "WalkerRandomParams-v0"}
 
 
 def import_example(module: str) -> None:
@@ -52,7 +53,7 @@ def test_an_env_of_the_examples_whose_tasks_change_anything(module: str) -> None
     import_example(module)
     env = gym.make(DEPENDENT[module])
     check_task_env(env, n_episodes=1)
-    push = np.full(6, 0.3, dtype=np.float32)
+    push = np.full_like(env.action_space.sample(), 0.3)
     steps = []
     for task in (0, 1, 0):
         env.reset(seed=0, options={"task_id": task})
@@ -61,18 +62,28 @@ def test_an_env_of_the_examples_whose_tasks_change_anything(module: str) -> None
     np.testing.assert_array_equal(first, again)
     assert not np.allclose(np.array(first)[:, -1], np.array(other)[:, -1])
     moves_alike = np.allclose(np.array(first)[:, :-1], np.array(other)[:, :-1])
-    assert moves_alike == (module == "half_cheetah_velocity")
+    assert moves_alike == (module in DENSE)
     prior = {"name": "prior", "n_exploration_episodes": 1}
     plain = {"replay_buffer_kwargs": {"relabel_probability": 0.0}, "explorer": prior, "train_explorer": prior}
     model = PEARL("MlpPolicy", env, **{**TINY, **plain, "n_tasks_per_rollout": 1}).learn(1)
     assert model.observation_space.dtype == np.float32 and model.replay_buffer is not None and model.replay_buffer.size() > 0
 
 
+def test_successes_of_the_dense_point_robot_are_those_of_the_sparse_one() -> None:
+    importlib.import_module("examples.dense_point_robot")
+    envs = [gym.make(env_id) for env_id in ("DensePointRobot-v0", "SparsePointRobot-v0")]
+    told: list[list[bool]] = [[], []]
+    for env, successes in zip(envs, told, strict=True):
+        env.reset(seed=0, options={"task": [0.0, 1.0]})
+        successes += [bool(env.step(np.array([0, 1], dtype=np.float32))[-1]["is_success"]) for _ in range(12)]
+    assert told[0] == told[1] and True in told[0] and False in told[0]
+
+
 def test_the_experiments_are_of_registered_envs(monkeypatch: pytest.MonkeyPatch) -> None:
     known: dict[str, Any] = {}
     monkeypatch.setattr("sb3_htr.experiments.grid.EXPERIMENTS", known)
     runpy.run_module("examples.experiments")
-    assert set(known) == {*FAMILIES, "half_cheetah_velocity"}
+    assert set(known) == {*FAMILIES, "half_cheetah_velocity", "dense_context"}
     for experiment in known.values():
         cells = experiment.cells()
         assert len(cells) == 5 * len(experiment.variants) and cells[0].env_id in gym.registry
