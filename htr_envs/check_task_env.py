@@ -66,10 +66,11 @@ def _check_interface(env: gym.Env[Any, Any]) -> TaskFamily:
     _require(hasattr(base, "task_family"), f"The env has no `task_family`: {advice}")
     family: TaskFamily = base.task_family
     hooks = REWARD_HOOKS if _tells_rewards(family) else ()
+    for name in ("sample_tasks", *hooks, *TASK_SETS, "task_space"):
+        advice = "derive it from htr_envs.TaskFamily, and call its __init__ with the tasks."
+        _require(hasattr(family, name), f"The task family has no `{name}`: {advice}")
     for name in ("set_task", *hooks[::2], *TASK_SETS, "task_space"):
         _require(hasattr(base, name), f"The env has no `{name}`: derive it from htr_envs.TaskEnv.")
-    for name in ("sample_tasks", *hooks, *TASK_SETS, "task_space"):
-        _require(hasattr(family, name), f"The task family has no `{name}`: derive it from htr_envs.TaskFamily.")
     for what, space in (("observation_space", env.observation_space), ("action_space", env.action_space)):
         flat = isinstance(space, spaces.Box) and len(space.shape) == 1 and np.issubdtype(space.dtype, np.floating)
         _require(flat, f"The {what} must be a one-dimensional Box of floats.")
@@ -166,7 +167,8 @@ def _check_rewards(env: gym.Env[Any, Any], family: TaskFamily, episode: Episode,
     _require(_same(rewards, episode.rewards), "compute_reward does not give the rewards that step gave.")
     successes = family.is_success(episode.traj, task)
     shaped = isinstance(successes, np.ndarray) and successes.dtype == np.bool_
-    _require(shaped and _same(successes, episode.successes), "is_success does not give the info['is_success'] that step gave.")
+    _require(shaped, "is_success must return one bool for each step, an array (..., T).")
+    _require(_same(successes, episode.successes), "is_success does not give the info['is_success'] that step gave.")
 
 
 def _has_dense(family: TaskFamily, traj: Trajectory, task: FloatArray) -> bool:
@@ -242,7 +244,8 @@ def _check_hindsight(family: TaskFamily, episode: Episode) -> FloatArray:
     _require(_same(tasks, episode.achieved_tasks), "info['achieved_task'] is not the hindsight_task of its step.")
     for index, task in enumerate(tasks):
         solved = bool(family.is_success(traj, task)[index])
-        _require(solved, f"The state that hindsight_task was asked for does not solve it, at step {index} of an episode.")
+        advice = "every state must solve some task. What success asks for beside, such as a low speed, belongs into the task."
+        _require(solved, f"The state of step {index} does not solve the task that hindsight_task named for it: {advice}")
 
     vectorized = "hindsight_task is not vectorized: `index` must broadcast with the leading axes of the trajectory."
     indices = np.array([0, length // 2, length - 1])
@@ -275,7 +278,8 @@ def _check_no_leak(plain: Episode, other: Episode) -> None:
     same_states = same_states and _same(plain.traj.next_observations, other.traj.next_observations)
     _require(same_states, "The task leaks into the observations: same seed and actions, another task, other observations.")
     same_free = _same(plain.traj.task_free_reward, other.traj.task_free_reward)
-    _require(same_free, "info['task_free_reward'] depends on the task.")
+    advice = "_step_state returns what every task pays, and compute_reward adds what this one does."
+    _require(same_free, f"info['task_free_reward'] depends on the task: {advice}")
 
 
 def _check_episode(env: gym.Env[Any, Any], family: TaskFamily, seed: int) -> None:

@@ -21,6 +21,7 @@ from helpers import ENV_ID, ROLLOUT, MakePEARL, many
 from htr_envs import DynamicsVectorEnv, PointRobotEnv, PointRobotFamily, PointRobotVectorEnv, check_task_env
 from htr_envs.point_robot import PointRobotDynamics
 from sb3_htr import PEARL, evaluate_adaptation, load_untrusted
+from sb3_htr.adaptation import Step
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
 from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
@@ -58,7 +59,10 @@ class WithoutHook(gym.Wrapper[Any, Any, Any, Any]):
             lambda: WithSpaces(gym.make(ENV_ID), observation_space=spaces.Dict({"x": spaces.Box(0, 1, (2,))})),
             "The observation space is Dict.* but PEARL needs a Box of one axis",
         ),
-        (lambda: WithSpaces(gym.make(ENV_ID), action_space=spaces.Discrete(3)), "The action space is Discrete"),
+        (
+            lambda: WithSpaces(gym.make(ENV_ID), action_space=spaces.Discrete(3)),
+            "The action space is Discrete.*no discrete actions",
+        ),
         (lambda: gym.make(ENV_ID, reward_type="dense"), "reward_type is not 'sparse'.*rl_reward_type"),
         (lambda: PointRobotEnv(), "The env has no time limit"),
         (lambda: BatchedTaskVecEnv(PointRobotVectorEnv(2, max_episode_steps=None)), "The env has no time limit"),
@@ -402,6 +406,15 @@ class Penalized(PointRobotDynamics):
     [
         (Accumulating, PointRobotDynamics, "compute_reward of a whole episode differs from .* of its steps one by one"),
         (
+            type(
+                "Floats",
+                (PointRobotFamily,),
+                {"is_success": lambda *args: PointRobotFamily.is_success(*args).astype(np.float32)},
+            ),
+            PointRobotDynamics,
+            "is_success must return bool, one for each step, and returned float32",
+        ),
+        (
             Forgetful,
             Penalized,
             r"A step that does not solve its task.* returned 0, and its info.* is -0\.1",
@@ -596,6 +609,14 @@ def test_nan_at_meta_test_is_refused(explorer: str, tiny_pearl: MakePEARL) -> No
     adaptation = model.start_adaptation(2)
     with pytest.raises(ValueError, match=r"observations have shape \(2,\), expected \(2, obs_dim\), a row for each env"):
         adaptation.act(np.zeros(2, dtype=np.float32))
+
+
+def test_actions_in_units_of_the_robot_are_refused(tiny_pearl: MakePEARL) -> None:
+    adaptation, obs, done = tiny_pearl().start_adaptation(2), np.zeros((2, 2)), np.zeros(2, dtype=bool)
+    actions = np.array([[1.0, -1.0], [0.5, 1.9]])
+    with pytest.raises(ValueError, match=r"The actions of env 1 are .*1\.9.* observe takes what act returned"):
+        adaptation.observe(Step(obs, actions, np.zeros(2), obs, done))
+    adaptation.observe(Step(obs, np.clip(actions, -1, 1), np.zeros(2), obs, done))
 
 
 def test_a_state_that_is_no_z_is_refused(tiny_pearl: MakePEARL) -> None:

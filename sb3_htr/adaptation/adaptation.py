@@ -124,13 +124,14 @@ class Adaptation:
     def observe(self, step: Step) -> None:
         """
         :param step: what each env did
-        :raises ValueError: for arrays of other shapes, NaN and infinity
+        :raises ValueError: for arrays of other shapes, NaN and infinity, and actions that are not scaled
         """
         if not self.is_training:  # what is collected is checked where it is stored
             self._check("observations", step.observations, 2)
             self._check("rewards", step.rewards, 1)
             self._check("next_observations", step.next_observations, 2)
             self._check("actions", step.actions, 2)
+            self._check_scaled(step.actions)
         self._remember(step.observations, step.actions, step.rewards)
         self.task_reward = self._told(step) if self.is_training else self._learned(step)
         self.episode_return += self.task_reward
@@ -153,6 +154,16 @@ class Adaptation:
             raise ValueError(
                 f"The {name} of env {env} are {values[env]}, expected finite numbers up to {LARGEST:g}: they would be taken "
                 "for evidence. Begin a new Adaptation once the env is mended."
+            )
+
+    @staticmethod
+    def _check_scaled(actions: np.ndarray) -> None:
+        beyond = (np.abs(actions) > 1 + 1e-5).any(axis=1)
+        if beyond.any():
+            env = int(beyond.argmax())
+            raise ValueError(
+                f"The actions of env {env} are {actions[env]}, expected numbers from -1 to 1: observe takes what act gave, "
+                "and the robot what unscale_action makes of it."
             )
 
     @staticmethod

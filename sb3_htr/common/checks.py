@@ -54,12 +54,17 @@ def check_spaces(env: VecEnv) -> None:
     :param env: env to train on
     :raises ValueError: if observations or actions are not vectors of floats, or actions have no bounds
     """
-    for name, space in (("observation", env.observation_space), ("action", env.action_space)):
+    for name, space, advice in (
+        (
+            "observation",
+            env.observation_space,
+            "flatten it with a wrapper, hide the goal of a GoalEnv with htr_envs.hide_goal, and put images through an encoder "
+            "of your own.",
+        ),
+        ("action", env.action_space, "it has no discrete actions; flatten others with a wrapper."),
+    ):
         if not isinstance(space, spaces.Box) or len(space.shape) != 1:
-            raise ValueError(
-                f"The {name} space is {space}, but PEARL needs a Box of one axis: flatten it with a wrapper, hide the goal of "
-                "a GoalEnv with htr_envs.hide_goal, and put images through an encoder of your own."
-            )
+            raise ValueError(f"The {name} space is {space}, but PEARL needs a Box of one axis: {advice}")
     if not env.action_space.is_bounded():  # type: ignore[attr-defined]
         raise ValueError(f"The action space {env.action_space} has no bounds: give it some, and scale actions in the env.")
 

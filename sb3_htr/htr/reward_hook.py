@@ -33,7 +33,10 @@ def check_reward_hook(
     tasks = family.train_tasks[task]
     traj = columns.trajectory(rows[:, None])
     given, computed = rows[:, columns.reward], np.asarray(family.compute_reward(traj, tasks))[:, 0]
-    solved = family.is_success(traj, tasks)[:, 0]
+    successes = np.asarray(family.is_success(traj, tasks))
+    if successes.dtype != np.bool_:
+        raise ValueError(f"is_success must return bool, one for each step, and returned {successes.dtype}.")
+    solved = successes[:, 0]
     wrong = ~np.isclose(given, computed, rtol=1e-4, atol=1e-4)
     if wrong.any():
         i = int(wrong.argmax())

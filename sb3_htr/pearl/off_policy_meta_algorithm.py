@@ -522,9 +522,10 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
                 successes[episode] |= bool(step.infos[0].get("is_success", adaptation.task_reward[0] > 0))
         if adaptation.best_return[0] <= 0 and self.knowledge.tells_success:
             warnings.warn(
-                f"No reward was found in {n_episodes} episodes, so the agent is not adapted: allow more, or train longer. The "
-                f"most rewarded step returned {adaptation.largest_reward[0]:.2g} more than steps without success do, and "
-                f"{self.knowledge.threshold.item():.2g} would be a success: are rewards on the scale of meta-training?",
+                f"No reward was found in {n_episodes} episodes, so the agent is not adapted: allow more, or train longer. If "
+                "there was a success, its reward is on another scale than in meta-training: the most rewarded step returned "
+                f"{adaptation.largest_reward[0]:.2g} more than steps without success do, and at least "
+                f"{self.knowledge.threshold.item():.2g} would be one.",
                 stacklevel=2,
             )
         return AdaptedAgent(self.policy, adaptation.explorer.final_z()[0], returns, successes)

@@ -87,7 +87,7 @@ def test_aggregate_is_as_wide_as_it_says(tiny_pearl: MakePEARL, scale: float) ->
 def test_a_long_episode_narrows_the_posterior_as_much_as_a_context_of_training(tiny_pearl: MakePEARL) -> None:
     model = tiny_pearl()
     adaptation = begin(model, "aggregate", context_size=5)
-    rows = np.random.default_rng(0).normal(size=(50, 1, 4)).astype(np.float32)
+    rows = np.random.default_rng(0).uniform(-1, 1, size=(50, 1, 4)).astype(np.float32)
     for i, row in enumerate(rows):
         adaptation.observe(step(row[:, :2], [1.0], i == 49, actions=row[:, 2:]))
     obs, actions = (th.tensor(rows[[5, 15, 25, 35, 45], 0, columns]) for columns in (slice(0, 2), slice(2, 4)))
@@ -170,6 +170,31 @@ def test_it_goes_where_a_reward_may_still_be_and_stays_where_one_was(tiny_pearl:
     visited = np.diff(places.reshape(9, -1), axis=1) != 0
     assert visited[:, :5].any(), "it turns elsewhere within an episode"
     assert (rewards[:, -3:] == 5.0).all() and (np.ptp(places[:, -3:], axis=(1, 2)) == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("values", "chosen"),
+    [
+        ([1.0, 4.0, 3.0, 2.0], 1),
+        # What is worth no more than unrewarded steps is not gone for, however much less the others are worth
+        ([-1.0, -9.0, 0.5, -9.0], 2),
+        # Of a dense proxy: all are costs, and the least is best
+        ([-9.0, -7.0, -8.0, -3.0], 3),
+    ],
+)
+def test_of_what_is_as_likely_it_goes_for_what_the_critics_value_most(
+    tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch, values: list[float], chosen: int
+) -> None:
+    model = tiny_pearl()
+    known = know_tasks(model)
+
+    def of_tasks(obs: Any, z: th.Tensor) -> th.Tensor:
+        return th.tensor(values)[z[..., 0].long()]
+
+    monkeypatch.setattr(model.policy, "values", of_tasks)
+    adaptation = begin(model, "belief")
+    adaptation.act(np.zeros((1, 2), dtype=np.float32))
+    np.testing.assert_array_equal(adaptation.z, known[[chosen]])
 
 
 def test_what_was_learnt_in_one_env_stays_there(tiny_pearl: MakePEARL) -> None:

@@ -69,9 +69,9 @@ def begin(model: PEARL, explorer: Any, n_envs: int = 1, context_size: int = 64) 
 
 
 def step(obs: Any, rewards: Any, ended: Any, actions: Any = None) -> Step:
-    """One step of each env; as action, the observation. Its infos are empty."""
+    """One step of each env; as action, the observation, clipped. Its infos are empty."""
     obs, rewards = np.asarray(obs, dtype=np.float32), np.asarray(rewards, dtype=np.float64)
-    actions = obs if actions is None else actions
+    actions = np.clip(obs, -1, 1) if actions is None else actions
     dones = np.broadcast_to(np.asarray(ended, dtype=bool), rewards.shape)
     return Step(obs, actions, rewards, obs, dones, [{}] * len(rewards))
 

@@ -300,7 +300,7 @@ class RewardInPlace(LineFamily):
         return rewards
 
 
-@breaks("The state that hindsight_task was asked for does not solve it")
+@breaks("does not solve the task that hindsight_task named for it")
 class UnsolvedHindsight(LineFamily):
     def hindsight_task(self, traj: Any, index: Any) -> Any:
         return super().hindsight_task(traj, index) + np.float32(0.2)

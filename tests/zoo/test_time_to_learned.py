@@ -24,7 +24,7 @@ def write_run(folder: Path, returns: list[float], log: str | None = None) -> Pat
 
 @pytest.mark.parametrize(
     ("returns", "steps"),
-    [([0, 9, 9.6, 9.4, 10], 3000), ([0, 0, 0], 1000), ([-50, -13, -10, -10], 3000), ([0, 12, 10], 2000), ([10], 1000)],
+    [([0, 9, 9.6, 9.4, 10], 3000), ([-50, -13, -10, -10], 3000), ([0, 12, 10], 2000)],
 )
 def test_solved_is_95_percent_of_the_way_to_the_last_evaluation(tmp_path: Path, returns: list[float], steps: int) -> None:
     time = time_to_learned(write_run(tmp_path, returns))
@@ -36,5 +36,11 @@ def test_seconds_are_those_of_the_log_between_rollouts(tmp_path: Path) -> None:
     assert time_to_learned(write_run(tmp_path, [0, 0, 10], log)) == (3000, 6.0)
 
 
-def test_a_run_without_evaluations_says_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize("returns", [[0, 0, 0], [3, 5, 1]])
+def test_what_ends_where_it_was_lowest_has_learned_nothing(tmp_path: Path, returns: list[float]) -> None:
+    assert time_to_learned(write_run(tmp_path, returns)) == (math.inf, math.inf)
+
+
+def test_a_run_without_two_evaluations_says_nothing(tmp_path: Path) -> None:
     assert time_to_learned(tmp_path) is None
+    assert time_to_learned(write_run(tmp_path, [10])) is None

@@ -26,11 +26,12 @@ class Belief(ParticleExplorer):
 
     First it searches: z is that of the particle whose episode would earn most, and soonest: what the belief expects its
     rewarded steps to earn, times the critics' value of going there from here, beside what unrewarded steps return; chosen anew
-    within an episode. What several z found cannot be repeated: every other episode searches, until one with a single z has
-    returned half as much. The others have a single z, the one that promises the largest return: of a particle, under the same
-    belief; of the best episode so far, what it returned. The encoder's posterior mean, given a new best episode, is tried
-    once. Where an episode begins elsewhere each time, a z that was good may be a bad one: an episode that is not rewarded and
-    whose value, as it goes on, is not what it was at the start, searches on to its end.
+    within an episode. (Where no value is above that, as with critics that learn from a dense proxy, beside the lowest
+    one.) What several z found cannot be repeated: every other episode searches, until one with a single z has returned half as
+    much. The others have a single z, the one that promises the largest return: of a particle, under the same belief; of the
+    best episode so far, what it returned. The encoder's posterior mean, given a new best episode, is tried once. Where an
+    episode begins elsewhere each time, a z that was good may be a bad one: an episode that is not rewarded and whose value, as
+    it goes on, is not what it was at the start, searches on to its end.
 
     :param margin: a particle must promise so many times what the best episode returned, to be tried in its place
     :param kept: when an episode with one z keeps its word: of what was found, the share that it must return to end the search;
@@ -107,8 +108,10 @@ class Belief(ParticleExplorer):
         n_compared = min(N_COMPARED, len(self.particles.z))
         gain, index = (self.weights(envs) @ self.particles.gain.T).topk(n_compared, dim=1)
         z = self.particles.z[index]
-        beside = self.adaptation.policy.values(obs[envs], z) - self.adaptation.knowledge.task_free_value
-        promise = gain * beside.clamp(min=0)
+        values, level = self.adaptation.policy.values(obs[envs], z), self.adaptation.knowledge.task_free_value
+        # Critics that learn from a dense proxy have another level, of which nothing tells: then it is the worst of them
+        level = th.where(values.amax(dim=1, keepdim=True) > level, level, values.amin(dim=1, keepdim=True))
+        promise = gain * (values - level).clamp(min=0)
         return z[th.arange(len(envs)), promise.argmax(dim=1)]
 
     def _exploit(self, envs: np.ndarray, obs: np.ndarray) -> None:

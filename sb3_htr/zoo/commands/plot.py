@@ -173,8 +173,9 @@ def print_time_to_learned(groups: dict[str, list[TrainedAgent]]) -> None:
         if times:
             steps, seconds = np.median(times, axis=0)
             clock = "" if np.isnan(seconds) else f", {seconds:,.0f} seconds with evaluations"
+            when = f"95 % of the way to its last return after {steps:,.0f} env steps{clock}"
             runs = f" (median of {len(times)} runs)" if len(times) > 1 else ""
-            print(f"{label}: 95 % of the way to its last return after {steps:,.0f} env steps{clock}{runs}")
+            print(f"{label}: {when if np.isfinite(steps) else 'nothing learnt, the last evaluation is the lowest'}{runs}")
 
 
 def main(argv: Sequence[str]) -> None:
