@@ -297,8 +297,9 @@ def hide_goal(env_id: str, **env_kwargs: Any) -> str:
     hidden_id = f"{NAMESPACE}/{spec.id.replace('/', '-')}"
     # the registration, not its id: in a process of its own the registry may not have it
     known = gym.registry.get(hidden_id)
-    if known is None or GoalEnvSource.find(known.kwargs["env_id"], {}) != GoalEnvSource.find(spec, {}):
-        steps = spec.max_episode_steps
+    steps = spec.max_episode_steps
+    is_known = known is not None and known.max_episode_steps == steps
+    if known is None or not is_known or GoalEnvSource.find(known.kwargs["env_id"], {}) != GoalEnvSource.find(spec, {}):
         register(hidden_id, "htr_envs.goal_env:HiddenGoalEnv", max_episode_steps=steps, kwargs={"env_id": spec})
     return hidden_id
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import importlib
+import inspect
 import sys
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -13,7 +14,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from gymnasium.envs.registration import EnvSpec
+from gymnasium.envs.registration import EnvSpec, load_env_creator
 from gymnasium.error import DependencyNotInstalled, UnregisteredEnv
 from numpy.typing import ArrayLike
 
@@ -57,7 +58,9 @@ class GoalEnvSource:
     @lru_cache(maxsize=16)  # noqa: B019 sources are few; a copy may have objects of another address, and be another source
     def dense(self) -> GoalEnvSource | None:
         """The same env with its dense reward, None where it has no argument ``reward_type``."""
-        return self.find(self.spec, {"reward_type": "dense"}) if "reward_type" in self.spec.kwargs else None
+        creator = load_env_creator(self.entry_point) if isinstance(self.entry_point, str) else self.entry_point
+        has_one = "reward_type" in {*self.spec.kwargs, *inspect.signature(creator).parameters}
+        return self.find(self.spec, {"reward_type": "dense"}) if has_one else None
 
     def make(self, **kwargs: Any) -> gym.Env[Any, Any]:
         """Make an env without a time limit.

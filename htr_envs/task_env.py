@@ -19,6 +19,8 @@ from htr_envs.meta_env import FloatArray, MetaEnv, TaskDistribution
 BoolArray = NDArray[np.bool_]
 
 REWARD_TYPES = ("sparse", "dense")
+# How near drawn tasks may be to others, as shares of the range, and how often they are drawn until none is nearer
+NEAREST, MAX_DRAWS = 1e-6, 100
 
 
 class Trajectory(NamedTuple):
@@ -102,13 +104,20 @@ def draw_task_sets(
         # nothing lies beyond an interval that goes to the end
         train = train if high == 1.0 else np.where(train < low, train, train + (high - low))
 
-    def draw(n: int, purpose: int) -> NDArray[np.float64]:
+    def draw(n: int, purpose: int, others: NDArray[np.float64]) -> NDArray[np.float64]:
         random_state = np.random.RandomState([task_seed, purpose])
-        values = low + (high - low) * (np.arange(n) + random_state.uniform(size=n)) / n
+        part, values = np.arange(n), np.zeros(n)
+        for _ in range(MAX_DRAWS):
+            values[part] = low + (high - low) * (part + random_state.uniform(size=len(part))) / n
+            # In float32, two of them may be one task
+            part = np.flatnonzero(np.abs(values[:, None] - others).min(axis=1) < NEAREST)
+            if len(part) == 0:
+                break
         random_state.shuffle(values)
         return values
 
-    return train, draw(n_validation_tasks, 1), draw(n_test_tasks, 2)
+    validation = draw(n_validation_tasks, 1, train)
+    return train, validation, draw(n_test_tasks, 2, np.append(train, validation))
 
 
 class TaskFamily(TaskDistribution):

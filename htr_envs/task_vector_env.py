@@ -156,10 +156,12 @@ class TaskVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]], ABC):
             raise ResetNeeded("step was called before the first reset: call reset() first.")
         actions = checked_action(actions, self.action_space)
         states, task_free_reward, terminated = self._step_state(actions)
-        if np.shape(task_free_reward) != (self.num_envs,) or np.shape(terminated) != (self.num_envs,):
+        given = tuple(map(np.shape, (states, task_free_reward, terminated)))
+        expected = (self._observations.shape, (self.num_envs,), (self.num_envs,))
+        if given != expected:
             raise ValueError(
                 "_step_state returns observations, task-free rewards and terminations, one of each for each env: expected "
-                f"arrays of shape ({self.num_envs},), got {np.shape(task_free_reward)} and {np.shape(terminated)}."
+                f"arrays of the shapes {expected}, got {given}."
             )
         task_free_reward, terminated = np.asarray(task_free_reward), np.asarray(terminated, dtype=np.bool_)
         final_obs = np.array(states, dtype=np.float32)

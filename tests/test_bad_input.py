@@ -607,14 +607,54 @@ def test_nan_at_meta_test_is_refused(explorer: str, tiny_pearl: MakePEARL) -> No
         with pytest.raises(ValueError, match=rf"The (next_)?{what} of env 0 are .*nan.* expected finite numbers"):
             model.adapt(env, n_episodes=2, explorer=explorer)
     adaptation = model.start_adaptation(2)
-    with pytest.raises(ValueError, match=r"observations have shape \(2,\), expected \(2, obs_dim\), a row for each env"):
+    with pytest.raises(ValueError, match=r"observations have shape \(2,\), expected \(2, 2\), a row for each env"):
         adaptation.act(np.zeros(2, dtype=np.float32))
+
+
+def test_seeds_may_be_numbers_of_numpy(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    seeds: Any = np.arange(2)
+    for seed in seeds:
+        model.adapt(ENV_ID, n_episodes=1, seed=seed)
+        evaluate_adaptation(model, ENV_ID, n_episodes=1, seed=seed)
+
+
+@pytest.mark.parametrize("width", [1, 3])
+def test_observations_of_another_width_are_refused_at_meta_test(tiny_pearl: MakePEARL, width: int) -> None:
+    with pytest.raises(ValueError, match=rf"observations have shape \(1, {width}\), expected \(1, 2\), a row for each env"):
+        tiny_pearl().start_adaptation(1).act(np.zeros((1, width), dtype=np.float32))
+
+
+def test_each_env_says_whether_its_episode_ended(tiny_pearl: MakePEARL) -> None:
+    zeros = np.zeros((3, 2))
+    with pytest.raises(ValueError, match=r"dones have shape \(1,\), expected \(3,\), a row for each env"):
+        tiny_pearl().start_adaptation(3).observe(Step(zeros, zeros, np.zeros(3), zeros, np.ones(1, dtype=bool)))
+
+
+def test_what_the_model_gives_its_replay_buffer_is_no_setting() -> None:
+    with pytest.raises(ValueError, match="replay_buffer_kwargs has no setting 'seed'"):
+        PEARL("MlpPolicy", ENV_ID, replay_buffer_kwargs={"seed": 3})
+
+
+def test_a_stranger_s_model_on_an_env_of_other_spaces(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    tiny_pearl().save(tmp_path / "model")
+    with pytest.raises(ValueError, match="The action space is Discrete"):
+        load_untrusted(tmp_path / "model", gym.make("CartPole-v1"))
+
+
+def test_a_model_that_acted_unadapted_warns_again_when_it_was_loaded(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    model = tiny_pearl()
+    for _ in range(2):
+        with pytest.warns(UserWarning, match="This PEARL is not adapted to any task"):
+            model.predict(np.zeros(2, dtype=np.float32))
+        model.save(tmp_path / "model")
+        model = PEARL.load(tmp_path / "model")
 
 
 def test_actions_in_units_of_the_robot_are_refused(tiny_pearl: MakePEARL) -> None:
     adaptation, obs, done = tiny_pearl().start_adaptation(2), np.zeros((2, 2)), np.zeros(2, dtype=bool)
     actions = np.array([[1.0, -1.0], [0.5, 1.9]])
-    with pytest.raises(ValueError, match=r"The actions of env 1 are .*1\.9.* observe takes what act returned"):
+    with pytest.raises(ValueError, match=r"The actions of env 1 are .*1\.9.* observe takes what act gave"):
         adaptation.observe(Step(obs, actions, np.zeros(2), obs, done))
     adaptation.observe(Step(obs, np.clip(actions, -1, 1), np.zeros(2), obs, done))
 
@@ -738,5 +778,7 @@ def test_a_step_of_all_envs_tells_of_each(tiny_pearl: MakePEARL, monkeypatch: py
     monkeypatch.setattr(
         vector_env, "_step_state", lambda actions: (np.zeros((4, 2), dtype=np.float32), 0.0, np.zeros(4, bool))
     )
-    with pytest.raises(ValueError, match=r"expected arrays of shape \(4,\), got \(\) and \(4,\)"):
+    with pytest.raises(
+        ValueError, match=r"expected arrays of the shapes \(\(4, 2\), \(4,\), \(4,\)\), got \(\(4, 2\), \(\), \(4,\)\)"
+    ):
         env.step(np.zeros((4, 2), dtype=np.float32))

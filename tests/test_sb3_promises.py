@@ -10,12 +10,18 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import CallbackList, CheckpointCallback, StopTrainingOnMaxEpisodes
+from stable_baselines3.common.callbacks import (
+    CallbackList,
+    CheckpointCallback,
+    StopTrainingOnMaxEpisodes,
+    StopTrainingOnNoModelImprovement,
+)
 from stable_baselines3.common.logger import configure
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL
 from helpers import parameters as all_parameters
 from sb3_htr import PEARL, evaluate_adaptation
+from sb3_htr.adaptation import MetaEvalCallback
 from sb3_htr.common.vec_env import make_task_vec_env
 
 
@@ -108,6 +114,22 @@ def test_sb3s_callbacks_work(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
     model.learn(10 * ROLLOUT, callback=CallbackList([save, stop]))
     assert model.num_timesteps < 10 * ROLLOUT and model._episode_num >= 36
     assert list(tmp_path.glob("*.zip")) and list(tmp_path.glob("*replay_buffer*"))
+
+
+def test_a_callback_that_an_evaluation_calls_goes_on_where_it_was(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    """A training that learns nothing is stopped at the same step, interrupted or not."""
+    steps = []
+    for parts in ([40 * ROLLOUT], [6 * ROLLOUT, 40 * ROLLOUT]):
+        model, state = tiny_pearl(learning_rate=0.0), None
+        for total in parts:
+            patience = StopTrainingOnNoModelImprovement(max_no_improvement_evals=6)
+            evaluation = MetaEvalCallback(ENV_ID, eval_freq=60, n_eval_episodes=1, callback_after_eval=patience, verbose=0)
+            if state is not None:
+                evaluation.load_state_dict(state)
+            model.learn(total - model.num_timesteps, evaluation, reset_num_timesteps=False)
+            state = evaluation.state_dict()
+        steps.append(model.num_timesteps)
+    assert steps[0] == steps[1] < 40 * ROLLOUT
 
 
 def test_the_logger_can_be_replaced(tiny_pearl: MakePEARL, tmp_path: Path) -> None:

@@ -105,7 +105,7 @@ class Adaptation:
         :raises ValueError: for an array of another shape, NaN and infinity
         """
         if not self.is_training:
-            self._check("observations", obs, 2)
+            self._check("observations", obs, self.policy.obs_dim)
         self.explorer.look(obs)
         return self.policy.act(obs, self.z, deterministic)
 
@@ -127,10 +127,11 @@ class Adaptation:
         :raises ValueError: for arrays of other shapes, NaN and infinity, and actions that are not scaled
         """
         if not self.is_training:  # what is collected is checked where it is stored
-            self._check("observations", step.observations, 2)
-            self._check("rewards", step.rewards, 1)
-            self._check("next_observations", step.next_observations, 2)
-            self._check("actions", step.actions, 2)
+            self._check("observations", step.observations, self.policy.obs_dim)
+            self._check("rewards", step.rewards)
+            self._check("next_observations", step.next_observations, self.policy.obs_dim)
+            self._check("actions", step.actions, self.policy.action_dim)
+            self._check("dones", step.dones)
             self._check_scaled(step.actions)
         self._remember(step.observations, step.actions, step.rewards)
         self.task_reward = self._told(step) if self.is_training else self._learned(step)
@@ -142,11 +143,9 @@ class Adaptation:
         self.episode_return[ended] = 0
         self._n_steps[ended] = 0
 
-    def _check(self, name: str, values: np.ndarray, n_axes: int) -> None:
-        shape = np.shape(values)
-        if len(shape) != n_axes or shape[0] != self.n_envs:
-            width = "" if n_axes == 1 else " action_dim" if name == "actions" else " obs_dim"
-            expected = f"({self.n_envs},{width})"
+    def _check(self, name: str, values: np.ndarray, *width: int) -> None:
+        shape, expected = np.shape(values), (self.n_envs, *width)
+        if shape != expected:
             raise ValueError(f"The {name} have shape {shape}, expected {expected}, a row for each env.")
         usual = np.abs(values) <= LARGEST  # which nothing is that is NaN
         if not usual.all():

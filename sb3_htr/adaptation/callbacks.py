@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 
 from sb3_htr.adaptation.evaluation import MetaLearner, first_success, record_adaptation, task_set
 from sb3_htr.adaptation.explorers import to_explorer
@@ -47,7 +47,10 @@ class MetaEvalCallback(EvalCallback):
             eval_env = make_task_vec_env(eval_env, N_ENVS)
         super().__init__(eval_env, n_eval_episodes=n_eval_episodes, **kwargs)
         self.tasks = task_set(get_task_family(self.eval_env), tasks)
-        self.explorer = None if explorer is None else to_explorer(explorer)
+        if explorer is not None:
+            to_explorer(explorer)  # says now what is wrong with it
+        # As it was given: a name means the model's own explorer where that has the name, with its settings
+        self.explorer = explorer
         self.returns: list[np.ndarray] = []
         self.successes: list[np.ndarray] = []
 
@@ -60,6 +63,10 @@ class MetaEvalCallback(EvalCallback):
             "returns": [th.from_numpy(returns) for returns in self.returns],
             "successes": [th.from_numpy(successes) for successes in self.successes],
             "best_mean_reward": float(self.best_mean_reward),
+            "children": [
+                {name: value for name, value in vars(child).items() if type(value) in (bool, int, float)}
+                for child in self._children()
+            ],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -70,6 +77,13 @@ class MetaEvalCallback(EvalCallback):
         self.returns = [returns.numpy() for returns in state["returns"]]
         self.successes = [successes.numpy() for successes in state["successes"]]
         self.best_mean_reward = state["best_mean_reward"]
+        # Older checkpoints have none
+        for child, numbers in zip(self._children(), state.get("children", []), strict=False):
+            vars(child).update(numbers)
+
+    def _children(self) -> list[BaseCallback]:
+        """Callbacks that are called after an evaluation, and on a new best one."""
+        return [child for child in (self.callback, self.callback_on_new_best) if child is not None]
 
     def _init_callback(self) -> None:
         # SB3's warns where training and evaluation envs are of different types, which they may be here

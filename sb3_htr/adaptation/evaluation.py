@@ -174,6 +174,7 @@ def record_adaptation(
     model.check_env(env)
     tasks = task_set(get_task_family(env), "test" if tasks is None else tasks)
     get_max_episode_steps(env)
+    seed = int(seed)  # torch takes no numbers of numpy
     generator = th.Generator().manual_seed(seed)
     env.seed(seed)
     records = []

@@ -103,8 +103,10 @@ class LatentKnowledge(nn.Module):
         :param gamma: discount
         """
         self.set_aggregate(means)
-        # A loaded model's particles are kept until this training knows as many
-        if bank.n_solved >= max(int(self.n_particles), 1):
+        # A loaded model's particles are kept until this training knows as many tasks, or as many training tasks
+        n_known = int(self.is_train[: int(self.n_particles)].sum())
+        knows_enough = bank.n_train_solved >= min(n_known, bank.n_train) or bank.n_solved >= int(self.n_particles)
+        if bank.n_solved > 0 and knows_enough:
             with th.no_grad():
                 particles = self._solved(policy, bank, gamma)
             self.set_particles(particles)

@@ -32,6 +32,8 @@ class Encoder(Protocol):
 class ContextualPolicy(AdaptingPolicy, Protocol):
     """Actor, critics, encoder and a model of rewards; :class:`sb3_htr.pearl.policies.PEARLPolicy` is one."""
 
+    obs_dim: int
+    action_dim: int
     latent_dim: int
     reward_model: Any
 

@@ -152,7 +152,8 @@ class TaskBank:
         :return: tasks and episodes, for :meth:`load_state_dict`
         """
         arrays = {name: th.tensor(getattr(self, name)) for name in ARRAYS}
-        return {**arrays, "random": get_generator_state(self._rng)}
+        new = [[task, th.tensor(episode)] for task, episode in self.new]
+        return {**arrays, "new": new, "random": get_generator_state(self._rng)}
 
     def check(self, state: dict[str, Any]) -> None:
         """
@@ -177,6 +178,8 @@ class TaskBank:
         self.check(state)
         for name in ARRAYS:
             setattr(self, name, state[name].cpu().numpy().copy())
+        # Older files have none, as nothing was left over between rollouts
+        self.new = [(task, episode.cpu().numpy().copy()) for task, episode in state.get("new", [])]
         set_generator_state(self._rng, state["random"])
 
     def rank(self, likelihood: np.ndarray) -> None:

@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
@@ -49,7 +50,7 @@ def check_has_env(env: VecEnv | None) -> None:
         raise ValueError("The model was loaded without an env, which learning needs: pass env to load, or call set_env.")
 
 
-def check_spaces(env: VecEnv) -> None:
+def check_spaces(env: GymEnv) -> None:
     """
     :param env: env to train on
     :raises ValueError: if observations or actions are not vectors of floats, or actions have no bounds

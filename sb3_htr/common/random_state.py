@@ -52,8 +52,9 @@ def set_global_state(state: dict[str, Any]) -> None:
     name, keys, position, has_gauss, cached = state["numpy"]
     np.random.set_state((name, np.array(keys, dtype=np.uint32), position, has_gauss, cached))
     th.set_rng_state(state["torch"].cpu())
-    if state["cuda"]:
-        th.cuda.set_rng_state_all([cuda.cpu() for cuda in state["cuda"]])
+    # The machine before may have had more of them
+    for device, cuda in zip(range(th.cuda.device_count()), state["cuda"], strict=False):
+        th.cuda.set_rng_state(cuda.cpu(), device)
 
 
 @contextmanager

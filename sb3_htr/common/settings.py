@@ -79,15 +79,18 @@ def keywords_of(function: Callable[..., Any]) -> set[str]:
     return known - {"self"}
 
 
-def check_keywords(owner: str, given: Iterable[str], function: Callable[..., Any], also: Iterable[str] = ()) -> None:
+def check_keywords(
+    owner: str, given: Iterable[str], function: Callable[..., Any], also: Iterable[str] = (), without: Iterable[str] = ()
+) -> None:
     """
     :param owner: whose keywords they are, for the message
     :param given: names that a user gave
     :param function: that takes them, or a class
     :param also: names that are known elsewhere
+    :param without: names that are not for the user to give
     :raises ValueError: for the first name that is not known, with the one most like it
     """
-    known = keywords_of(function) | set(also)
+    known = (keywords_of(function) | set(also)) - set(without)
     for name in given:
         if name not in known:
             nearest = difflib.get_close_matches(name, known, n=1)

@@ -96,7 +96,8 @@ class MultiTaskSamples(NamedTuple):
     :param dones: (N,), 1 where the episode terminated (time limits do not count)
     :param discounts: (N,), of the value of the next observation
     :param lengths: (M,) int64, how many of these transitions are of each task, at least 1
-    :param task_ids: (M,) int array, the training task whose replay each row of the meta-batch came from
+    :param task_ids: (M,) int array, the training task that was drawn for each row of the meta-batch; a relabelled row may
+        have the experience of other ones
     :param relabelled: (M,) bool array, whether context and RL batch carry rewards of a hindsight task
     :param unrewarded: (M,) bool array, whether no transition of the RL batch has a reward with a part that depends on the task
     :param labels: of some of these transitions, None unless asked for, and where the family tells no rewards

@@ -258,7 +258,8 @@ def make_task_vec_env(
             advice = "Import the package that registers it before, as in `import htr_envs`."
         raise type(error)(f"{error} {advice}") from None
     venv: VecEnv
-    if spec.vector_entry_point is None or wrapper is not None or vec_env_class is not None:
+    # A batch draws no pictures
+    if spec.vector_entry_point is None or wrapper is not None or vec_env_class is not None or "render_mode" in env_kwargs:
 
         def make_env() -> gym.Env:
             if vec_env_class is SubprocVecEnv:

@@ -155,7 +155,11 @@ class EpisodeStore:
             "lengths": self._lengths[: self._n_slots],
             "data": self._data[: self._n_slots],
         }
-        return {**{name: th.tensor(array) for name, array in arrays.items()}, "capacity": th.tensor(len(self._data))}
+        return {
+            **{name: th.tensor(array) for name, array in arrays.items()},
+            "capacity": th.tensor(len(self._data)),
+            "in_order": th.tensor(self.in_order),
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """
@@ -167,6 +171,11 @@ class EpisodeStore:
             raise ValueError(
                 f"The saved episodes have {arrays['slots'].shape[1]} slots a task of shape {arrays['data'].shape[1:]}, this "
                 f"buffer has {self.episodes_per_task} of {self._data.shape[1:]}: use the settings that they were saved with."
+            )
+        if arrays.get("in_order", self.in_order) != self.in_order:
+            raise ValueError(
+                "Of the saved episodes and those of this model, one follows the order of time and the other does not: use the "
+                "settings that they were saved with."
             )
         self.n_added, self._slots = arrays["n_added"], arrays["slots"]
         self._n_slots = len(arrays["data"])

@@ -132,7 +132,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         self._open_task = np.full(n_envs, -1, dtype=np.int64)
         self.seed(seed)
         # A copy: what the user gave holds settings, and can be given to another buffer
-        self.relabeller = copy.copy(make("relabeller", relabeller, RELABELLERS, Relabeller))
+        self.relabeller = copy.deepcopy(make("relabeller", relabeller, RELABELLERS, Relabeller))
         self.relabeller.bind(self)
         # Told of every finished episode: the training task that it was collected on, and its transitions
         self.episode_listeners: list[Callable[[int, np.ndarray], None]] = []

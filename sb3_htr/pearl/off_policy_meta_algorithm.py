@@ -44,6 +44,17 @@ from sb3_htr.pearl.policies import PEARLPolicy
 
 # An adaptation gives up after an episode of so many times those of training: an env that never ends one would hang
 ENDLESS = 10
+# Arguments of the replay buffer that are the model's
+GIVEN_BY_MODEL = (
+    "buffer_size",
+    "observation_space",
+    "action_space",
+    "device",
+    "n_envs",
+    "seed",
+    "task_family",
+    "max_episode_steps",
+)
 # Env steps for each update that are warned of if they are more: SAC's gradient_steps are 1, but for each env step
 MAX_STEPS_PER_UPDATE = 1000
 
@@ -106,7 +117,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
             seed = int(seed)  # numpy's are no seeds for Python's own generator
         self.explorer, self.train_explorer = to_explorer(explorer), to_explorer(train_explorer)
         buffer_class = replay_buffer_class or MultiTaskReplayBuffer
-        check_keywords("replay_buffer_kwargs", replay_buffer_kwargs or {}, buffer_class)
+        check_keywords("replay_buffer_kwargs", replay_buffer_kwargs or {}, buffer_class, without=GIVEN_BY_MODEL)
         if isinstance(env, str):
             env = make_task_vec_env(env, n_tasks_per_rollout, seed=seed)
         if env is not None:
@@ -308,6 +319,8 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
                 "load_replay_buffer brings back what save_replay_buffer has saved.",
                 stacklevel=3,
             )
+        # The weights of a file may be of a family without successes
+        self.knowledge.set_tells_success(self.replay_buffer.tells_rewards)
         return super()._setup_learn(*args, **kwargs)
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
@@ -497,6 +510,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
             vec_env.set_options({"task_id": int(task)} if np.ndim(task) == 0 else {"task": np.asarray(task, dtype=np.float32)})
         elif task is not None:
             raise ValueError("The env has no task family, so it takes no task: leave task out, and set its task yourself.")
+        seed = int(seed)  # torch takes no numbers of numpy
         adaptation = self.start_adaptation(1, explorer, th.Generator().manual_seed(seed))
         returns, successes = np.zeros(n_episodes), np.zeros(n_episodes, dtype=bool)
         act = partial(adaptation.act, deterministic=deterministic)
@@ -553,7 +567,8 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
     # Files and state
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "knowledge", "task_bank", "update_listeners"]
+        own = ["knowledge", "task_bank", "update_listeners", "_warned_not_adapted"]
+        return [*super()._excluded_save_params(), *own]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

@@ -11,6 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_htr.adaptation import explorers
+from sb3_htr.common.checks import check_spaces
 from sb3_htr.common.errors import last_line
 from sb3_htr.common.plain import Refused, read_model
 from sb3_htr.common.saving import with_suffix
@@ -84,7 +85,7 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
     if isinstance(env, str):
         env = make_task_vec_env(env)
     for name in ("policy_kwargs", "replay_buffer_kwargs"):
-        kwargs[name] = {**settings.pop(name), **kwargs.get(name, {})}
+        kwargs[name] = {**settings.pop(name), **(kwargs.get(name) or {})}
     _check_shapes(path, weights["policy"], env, kwargs["policy_kwargs"])
     model = PEARL("MlpPolicy", env, device=device, **{**settings, **kwargs})
     try:
@@ -136,6 +137,7 @@ def _policy_kwargs(given: dict[str, Any]) -> dict[str, Any]:
 
 def _check_shapes(path: str | os.PathLike[str], weights: dict[str, Any], env: GymEnv, policy_kwargs: dict[str, Any]) -> None:
     """Without memory for the weights."""
+    check_spaces(env)
     assert isinstance(env.observation_space, spaces.Box) and isinstance(env.action_space, spaces.Box)
     with th.device("meta"):
         expected = PEARLPolicy(env.observation_space, env.action_space, lambda _: 0.0, **policy_kwargs).state_dict()

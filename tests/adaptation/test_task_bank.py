@@ -220,16 +220,20 @@ def test_particles_are_the_tasks_that_were_ever_reached(tiny_pearl: MakePEARL) -
     np.testing.assert_array_equal(particles.is_train, solved.is_train)
 
 
-def test_particles_of_a_loaded_model_are_not_replaced_by_fewer(tiny_pearl: MakePEARL, tmp_path: Any) -> None:
-    """Without its replay buffer, a model knows few tasks when training goes on."""
+@pytest.mark.parametrize(
+    ("goal_distance", "n", "n_train", "kept"), [(1.0, 384, 384, True), (0.2, 384, 384, False), (1.0, 384, 0, False)]
+)
+def test_particles_of_a_loaded_model_are_kept_until_as_many_tasks_are_known(
+    tiny_pearl: MakePEARL, tmp_path: Any, goal_distance: float, n: int, n_train: int, kept: bool
+) -> None:
+    """Without its replay buffer, a model knows few when training goes on: all of its training tasks are enough."""
     tiny_pearl().save(tmp_path / "model")
-    loaded = PEARL.load(tmp_path / "model", env=make_task_vec_env(ENV_ID, 4, env_kwargs={"goal_distance": 0.2}))
-    for n, kept in ((384, True), (1, False)):
-        known = Particles(th.ones(n, 3), th.eye(n), th.eye(n), th.zeros(n), th.ones(n, dtype=th.bool))
-        loaded.knowledge.set_particles(known)
-        loaded.learn(ROLLOUT)
-        assert 1 < len(loaded.task_bank.solved().lengths) < 384  # type: ignore[union-attr]
-        assert (int(loaded.knowledge.n_particles) == n) == kept
+    loaded = PEARL.load(tmp_path / "model", env=make_task_vec_env(ENV_ID, 4, env_kwargs={"goal_distance": goal_distance}))
+    known = Particles(th.ones(n, 3), th.eye(n), th.eye(n), th.zeros(n), th.arange(n) < n_train)
+    loaded.knowledge.set_particles(known)
+    loaded.learn(ROLLOUT)
+    assert 1 < len(loaded.task_bank.solved().lengths) < n  # type: ignore[union-attr]
+    assert (int(loaded.knowledge.n_particles) == n) == kept
 
 
 def test_a_threshold_waits_for_a_success_that_the_bank_has_kept(tiny_pearl: MakePEARL) -> None:
@@ -241,3 +245,21 @@ def test_a_threshold_waits_for_a_success_that_the_bank_has_kept(tiny_pearl: Make
     bank.solved = lambda: solved()._replace(success=np.zeros_like(solved().success))  # type: ignore[method-assign]
     model.learn(ROLLOUT, reset_num_timesteps=False)
     assert model.knowledge.threshold == before
+
+
+def test_episodes_that_wait_for_the_next_update_are_saved(tiny_pearl: MakePEARL, tmp_path: Any) -> None:
+    """As where a callback stops a training within a rollout."""
+    model = tiny_pearl()
+    bank = model.task_bank
+    assert bank is not None
+    for episode in walks(bank, 3, seed=0):
+        bank.on_episode(1, episode)
+    model.save_replay_buffer(tmp_path / "buffer")
+    other = tiny_pearl()
+    other.load_replay_buffer(tmp_path / "buffer")
+    restored = other.task_bank
+    assert restored is not None and len(restored.new) == 3
+    for ours in (bank, restored):
+        ours.update()
+    np.testing.assert_array_equal(restored.tasks, bank.tasks)
+    np.testing.assert_array_equal(restored.best_return, bank.best_return)

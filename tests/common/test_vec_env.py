@@ -4,6 +4,7 @@ import os
 import signal
 import time
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from helpers import ENV_ID
+from htr_envs import PointRobotVectorEnv
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
 
 
@@ -67,3 +69,25 @@ def test_runs_of_consecutive_seeds_share_no_env() -> None:
         assert of_run == of_repetition
         draws += of_run
     assert len(set(draws)) == 10
+
+
+def test_envs_that_draw_are_stepped_one_by_one() -> None:
+    env = make_task_vec_env(ENV_ID, 2, env_kwargs={"render_mode": "rgb_array"})
+    env.reset()
+    picture = env.get_images()[1]
+    assert not isinstance(env.unwrapped, BatchedTaskVecEnv) and picture is not None and picture.shape[-1] == 3
+
+
+def test_a_batch_whose_observations_have_another_shape_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each env would be judged by what the first one sees."""
+    batch = PointRobotVectorEnv(2)
+    move = batch._step_state
+
+    def flat(actions: np.ndarray) -> Any:
+        states, *others = move(actions)
+        return states[:, 0], *others
+
+    monkeypatch.setattr(batch, "_step_state", flat)
+    batch.reset(seed=0)
+    with pytest.raises(ValueError, match=r"expected arrays of the shapes \(\(2, 2\), \(2,\), \(2,\)\), got \(\(2,\), "):
+        batch.step(batch.action_space.sample())

@@ -193,9 +193,28 @@ def test_relabellers_given_to_two_models_are_not_shared(tiny_pearl: MakePEARL, r
     assert ours.buffer is buffers[0] and theirs.buffer is buffers[1] and ours.policy is models[0].policy
     if isinstance(ours, EpisodeClustering) and isinstance(theirs, EpisodeClustering):
         assert ours.n_hindsight_buffers > 0 == theirs.n_hindsight_buffers
-        assert ours.discretiser is relabeller.discretiser is theirs.discretiser
+        assert vars(ours.discretiser) == vars(relabeller.discretiser) == vars(theirs.discretiser)
     alone = tiny_pearl(seed=2).replay_buffer
     assert alone is not None and buffers[1].size() == alone.size() == 0
+
+
+class Remembers(SingleEpisodeRelabelling):
+    """What it remembers is made with it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: list[int] = []
+
+    def on_episode(self, task: int, episode: np.ndarray) -> None:
+        self.seen.append(task)
+
+
+def test_what_a_relabeller_of_ones_own_remembers_is_of_one_model(tiny_pearl: MakePEARL) -> None:
+    kwargs = {"relabeller": Remembers()}
+    first, second = (tiny_pearl(replay_buffer_kwargs=kwargs).replay_buffer for _ in range(2))
+    assert first is not None and second is not None
+    first.relabeller.on_episode(3, np.zeros((1, 1)))
+    assert [vars(buffer.relabeller)["seen"] for buffer in (first, second)] == [[3], []]
 
 
 # --- bad input

@@ -219,12 +219,18 @@ def test_both_kinds_of_sparse_reward_become_one_and_zero(reward_type: str) -> No
     assert play(env, 0 * actions_of(env, 3), seed=0, options={"task": start})[1].tolist() == [1.0, 1.0, 1.0]
 
 
-def test_the_dense_reward_is_the_envs_own_or_the_distance() -> None:
+def test_the_dense_reward_is_the_envs_own_or_the_distance(monkeypatch: pytest.MonkeyPatch) -> None:
     zeros = np.zeros((1, 4), dtype=np.float32)
     traj = Trajectory(zeros, zeros, zeros, np.zeros(1, dtype=np.float32))
     own = HiddenGoalFamily(CHOICE, {"reward_type": "sparse"})
     assert own.compute_reward(traj, [3.0, 4.0], "dense") == pytest.approx(np.exp(-5.0))
     assert HiddenGoalFamily(TOY).compute_reward(traj, [3.0, 4.0], "dense") == -5.0
+    # That there is a choice, the constructor tells where the registration does not
+    made_by: Any = ChoiceEnv
+    monkeypatch.setitem(
+        gym.registry, "ToySilent-v0", gym.envs.registration.EnvSpec("ToySilent-v0", made_by, max_episode_steps=5)
+    )
+    assert HiddenGoalFamily("ToySilent-v0").compute_reward(traj, [3.0, 4.0], "dense") == pytest.approx(np.exp(-5.0))
 
 
 def test_nothing_tells_the_hidden_goal() -> None:
@@ -332,6 +338,13 @@ def test_any_id_is_registered_with_its_time_limit() -> None:
     env, base = make(hide_goal(TOY), n_train_tasks=4)
     assert env.spec is not None and env.spec.max_episode_steps == 30
     assert len(base.train_tasks) == 4
+
+
+def test_an_id_that_is_registered_again_with_another_time_limit_has_that(monkeypatch: pytest.MonkeyPatch) -> None:
+    for limit in (20, 50):
+        spec = gym.envs.registration.EnvSpec("ToyLimit-v0", gym.spec(TOY).entry_point, max_episode_steps=limit)
+        monkeypatch.setitem(gym.registry, "ToyLimit-v0", spec)
+        assert gym.spec(hide_goal("ToyLimit-v0")).max_episode_steps == limit
 
 
 def test_ids_that_are_spelt_are_registered() -> None:

@@ -54,7 +54,8 @@ class EpisodeClustering(HindsightBuffers):
     relabelled row of a meta-batch is drawn as PEARL draws it, from a random hindsight buffer in place of the task's own.
     (Algorithm 2, line 12 has the inequality inverted: B.3 swaps "according to probability K".)
 
-    Hindsight buffers need memory: it grows with their number, see :attr:`n_hindsight_buffers` and :attr:`nbytes`.
+    Hindsight buffers need memory: it grows with their number, see ``replay/n_hindsight_buffers`` and
+    ``replay/hindsight_megabytes`` in the logs.
 
     :param cell_size: grid of the task space, see :class:`GridDiscretiser`. Our choice for the Point Robot: 0.1, half the goal
         radius
@@ -105,7 +106,7 @@ class EpisodeClustering(HindsightBuffers):
         rng = buffer.relabel_rng
         steps = strategy.steps(np.full(strategy.n_candidates, len(episode)), rng)
         traj = buffer.transitions.trajectory(episode)
-        representatives = self.discretiser(buffer.task_family.hindsight_task(traj, steps))
+        representatives = np.asarray(self.discretiser(buffer.task_family.hindsight_task(traj, steps)), dtype=np.float32)
         count = np.array([[1 + self._n_episodes_of(representative) for representative in representatives]])
         is_solved = None
         if self.prefer_unsolved:
