@@ -1,5 +1,6 @@
 """The pictures of experiments, from the raw results of their cells."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,16 @@ def label(variant: str, runs: list[tuple[Cell, Any]], results: Results) -> str:
     return variant if len(runs) == n_seeds(results) else f"{variant} (seeds: {len(runs)})"
 
 
+def curves(runs: Sequence[Any], key: str) -> tuple[np.ndarray, np.ndarray]:
+    """
+    :param runs: raw results; where rollouts are longer than the time between evaluations, some have one more than others
+    :param key: ``"curve"`` or ``"solved"``
+    :return: env steps (n,), and means over the validation tasks (n_runs, n), of the evaluations that all have
+    """
+    n = min(len(raw["timesteps"]) for raw in runs)
+    return runs[0]["timesteps"][:n], np.stack([raw[key][:n].mean(axis=1) for raw in runs])
+
+
 def learning(results: Results, path: Path) -> None:
     """
     Left: learning curves on validation tasks. Right: the final models' adaptation to the test tasks, by the first explorer of
@@ -67,8 +78,8 @@ def learning(results: Results, path: Path) -> None:
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
     groups = by_variant(results)
     for colour, (variant, runs) in zip(curve_colours([*groups]), groups.items(), strict=True):
-        curve = np.stack([raw["curve"].mean(axis=1) for _, raw in runs])
-        band(left, runs[0][1]["timesteps"] / 1000, curve, colour, "-", label(variant, runs, results))
+        timesteps, curve = curves([raw for _, raw in runs], "curve")
+        band(left, timesteps / 1000, curve, colour, "-", label(variant, runs, results))
         explorers = [evaluation.explorer for evaluation in runs[0][0].evaluations if not evaluation.tested_on]
         styles = {"prior": "--", **dict.fromkeys(explorers[:1], "-")}
         for explorer in [explorer for explorer in explorers if explorer in styles]:
@@ -96,10 +107,11 @@ def race(results: Results, path: Path) -> None:
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained", sharey=True)
     groups = by_variant(results)
     for colour, (variant, runs) in zip(curve_colours([*groups]), groups.items(), strict=True):
-        solved = np.stack([100 * raw["solved"].mean(axis=1) for _, raw in runs])
+        timesteps, solved = curves([raw for _, raw in runs], "solved")
         name = f"{label(variant, runs, results)}, {runs[0][0].evaluations[0].explorer}"
-        band(left, runs[0][1]["timesteps"] / 1000, solved, colour, "-", name)
-        band(right, np.median([raw["elapsed_s"] for _, raw in runs], axis=0) / 60, solved, colour, "-", f"_{name}")
+        band(left, timesteps / 1000, 100 * solved, colour, "-", name)
+        minutes = np.median([raw["elapsed_s"][: len(timesteps)] for _, raw in runs], axis=0) / 60
+        band(right, minutes, 100 * solved, colour, "-", f"_{name}")
     for axes in (left, right):
         axes.set_xscale("log")
         axes.xaxis.set_major_formatter("{x:g}")
@@ -174,8 +186,8 @@ def relabelling(results: Results, path: Path) -> None:
     left.set_title("test tasks, final models", fontsize=10)
     shown = [variant for variant in groups if variant == "K = 0.8" or not variant.startswith("K = ")]
     for colour, variant in zip(curve_colours(shown), shown, strict=True):
-        curve = np.stack([run["curve"].mean(axis=1) for run in groups[variant]])
-        band(right, groups[variant][0]["timesteps"] / 1000, curve, colour, "-", variant)
+        timesteps, curve = curves(groups[variant], "curve")
+        band(right, timesteps / 1000, curve, colour, "-", variant)
     right.set_xlabel("thousand env steps of meta-training")
     right.set_ylabel("return of the last adaptation episode")
     right.set_title("validation tasks, hindsight task strategies and ablation", fontsize=10)

@@ -91,6 +91,9 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
         train.main(["--resume", str(unfinished[-1]), *packages] if unfinished else cell.training(folder))
         trained = find_finished(cell, folder)
         if trained is None:
+            run = find_runs(folder)[-1]
+            if n_steps_of(run / f"{file_stem(cell.env_id)}.zip") >= cell.n_timesteps:
+                raise OSError(f"{run} has its last model, but its last checkpoint could not be written: make room for it.")
             raise KeyboardInterrupt
     run, model = trained
     advice = f"Its run has to be trained again: remove {folder}."

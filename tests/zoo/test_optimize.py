@@ -78,8 +78,18 @@ def test_a_study_in_sqlite(quick: None, tmp_path: Path, capsys: pytest.CaptureFi
 def test_a_study_is_of_one_env_and_one_method(quick: None, tmp_path: Path) -> None:
     storage = f"sqlite:///{tmp_path}/study.db"
     assert search(tmp_path, storage, n_trials=1) == 0
-    with pytest.raises(ValueError, match="The study 'test' searches with method of the YAML file, and not htr-ec: choose"):
+    with pytest.raises(ValueError, match="The study 'test' is of method htr-ser, and not htr-ec: give --method htr-ser"):
         search(tmp_path, storage, method="htr-ec")
+    trained = ["train", "--env", ENV_ID, "--method", "pearl-sparse", "-f", str(tmp_path), "--storage", storage]
+    with pytest.raises(ValueError, match="The study 'test' is of method htr-ser, and not pearl-sparse"):
+        main([*trained, "--study-name", "test", "--trial-id", "0"])
+
+
+def test_a_mistyped_env_leaves_the_name_of_the_study_free(quick: None, tmp_path: Path) -> None:
+    storage = f"sqlite:///{tmp_path}/study.db"
+    with pytest.raises(ValueError, match="did you mean SparsePointRobot-v0"):
+        main(["optimize", "--env", "SparsePointRobto-v0", "--storage", storage, "--study-name", "test"])
+    assert search(tmp_path, storage, n_trials=1) == 0
 
 
 def test_a_study_in_a_journal(quick: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -32,7 +32,7 @@ def main(argv: Sequence[str]) -> None:
     parser = make_parser("experiment", about, EXAMPLE, parents=[own])
     parser.add_argument("name", choices=list(grid.EXPERIMENTS), metavar="NAME", help="one of the above")
     parser.add_argument("--seeds", type=int, help="runs of each variant (default: those of the experiment)")
-    parser.add_argument("--quick", action="store_true", help="one seed, a tenth of the env steps")
+    parser.add_argument("--quick", action="store_true", help="a tenth of the env steps, and one seed unless told otherwise")
     runs = "folder for the runs; those of an experiment resume from RUNS/NAME (default: runs)"
     parser.add_argument("--runs", type=Path, default=Path("runs"), help=runs)
     parser.add_argument("-o", "--output", type=Path, help="folder for the results (default: results/NAME)")
@@ -46,7 +46,7 @@ def main(argv: Sequence[str]) -> None:
     if ":/" in str(args.runs):
         raise ValueError(f"--runs is {args.runs}, expected a folder: object stores have to be mounted.")
     experiment = grid.EXPERIMENTS[args.name]
-    cells = experiment.cells(1, 0.1) if args.quick else experiment.cells(args.seeds)
+    cells = experiment.cells(args.seeds or 1, 0.1) if args.quick else experiment.cells(args.seeds)
     cells = [replace(cell, gym_packages=tuple(packages)) for cell in cells]
     if args.cell is not None and not 0 <= args.cell < len(cells):
         raise ValueError(f"--cell is {args.cell}, expected 0 to {len(cells) - 1}: the experiment has {len(cells)} runs.")
@@ -63,7 +63,8 @@ def main(argv: Sequence[str]) -> None:
         print(f"\nStopped. What ran goes on from its checkpoint in {runs} with the same command.", file=sys.stderr)
         raise SystemExit(130) from None
     output = args.output or Path("results", quick + args.name)
-    how = "--quick" if args.quick else f"--seeds {len({cell.seed for cell in cells})}"
+    how = ("--quick " if args.quick else "") + f"--seeds {len({cell.seed for cell in cells})}"
+    how += f" --gym-packages {' '.join(packages)}" if packages else ""
     results = {cell: cell.result(runs) for cell in cells}
     report.write(f"sb3-htr experiment {args.name} {how}", experiment, results, output)
     print(f"Results: {output}")

@@ -7,7 +7,6 @@ import shlex
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import optuna
 import sqlalchemy
@@ -91,8 +90,6 @@ def main(argv: Sequence[str]) -> None:
             "--storage needs a --study-name, by which other workers and `sb3-htr train --trial-id` find the study."
         )
     study = create_study(args.storage, args.study_name) if args.storage else None
-    if study is not None:
-        _check_same_search(study, {"env": args.env, "method": args.method or "of the YAML file"})
     # It was said above whether the study is new; to rl_zoo3 it never is
     logger = logging.getLogger("optuna.study.study")
     logger.addFilter(_is_news)
@@ -116,19 +113,6 @@ def main(argv: Sequence[str]) -> None:
         for option, values in {**given, "-params": args.hyperparams}.items():
             command += [option, *values] if values else []
         print(f"Train with the best trial so far: {shlex.join(command)}")
-
-
-def _check_same_search(study: optuna.Study, asked: dict[str, Any]) -> None:
-    """Trials of several envs have no best one."""
-    known = study.user_attrs
-    if different := [name for name, value in asked.items() if known.get(name, value) != value]:
-        name = different[0]
-        raise ValueError(
-            f"The study {study.study_name!r} searches with {name} {known[name]}, and not {asked[name]}: choose another "
-            "--study-name."
-        )
-    for name, value in asked.items():
-        study.set_user_attr(name, value)
 
 
 def without_password(storage: str) -> str:

@@ -21,6 +21,8 @@ from typing import Any, cast
 
 import optuna
 import rl_zoo3.train
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
 from rl_zoo3 import exp_manager
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
@@ -48,7 +50,7 @@ from sb3_htr.zoo.run.agents import RECORD, read_record
 from sb3_htr.zoo.run.algorithm import Algorithm
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback, ProgressCallback
 from sb3_htr.zoo.run.defaults import given_arguments
-from sb3_htr.zoo.run.folder import claim, lock
+from sb3_htr.zoo.run.folder import SystemLock, claim, lock
 from sb3_htr.zoo.run.method import DEFAULT, PEARLMethod, get_method, merged, names_of
 from sb3_htr.zoo.run.search_space import convert_pearl_params, sample_pearl_params
 from sb3_htr.zoo.run.shipped import find_hyperparams
@@ -73,6 +75,7 @@ class MetaExperimentManager(ExperimentManager):
         self._unique = kwargs.get("uuid_str", "")
         self.resumed = resumed
         self._claimed: Path | None = None
+        self._lock: SystemLock | None = None
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """
@@ -104,6 +107,7 @@ class MetaExperimentManager(ExperimentManager):
         if self.resumed is not None:  # what a user gave comes from a file now
             given = checked(given, self.resumed / RECORD)
         self._given = given
+        self._check_study()
         hyperparams = merged(merged(hyperparams, checked(self._trial(trial_id), self.storage)), given)
         if self.n_timesteps > 0:
             hyperparams["n_timesteps"] = self.n_timesteps
@@ -115,6 +119,25 @@ class MetaExperimentManager(ExperimentManager):
         print(f"Method {self.method.name}: {self.config} has the settings of the env. With those of the command line:")
         pprint(dict(saved))
         return hyperparams, saved
+
+    def _check_study(self) -> None:
+        """Trials of several envs or methods have no best one, and settings of one are none of another."""
+        if self.storage is None or self.study_name is None:
+            return
+        storage = JournalStorage(JournalFileBackend(self.storage)) if self.storage.endswith(".log") else self.storage
+        try:
+            study = optuna.load_study(study_name=self.study_name, storage=storage)
+        except KeyError:  # it is said elsewhere that there is none
+            return
+        for name, value in {"env": str(self.env_name.gym_id), "method": self.method.name}.items():
+            # Older studies do not say
+            if (known := study.user_attrs.get(name, value)) not in (value, "of the YAML file"):
+                raise ValueError(
+                    f"The study {study.study_name!r} is of {name} {known}, and not {value}: give --{name} {known}, or search "
+                    "under another --study-name."
+                )
+            if self.optimize_hyperparameters:
+                study.set_user_attr(name, value)
 
     def _trial(self, trial_id: int | None) -> dict[str, Any]:
         named = {"--storage": self.storage, "--study-name": self.study_name, "--trial-id": trial_id}
@@ -193,6 +216,8 @@ class MetaExperimentManager(ExperimentManager):
         except BaseException:
             if self._claimed is not None:  # nothing was trained in it
                 shutil.rmtree(self._claimed)
+            if self._lock is not None:
+                self._lock.release()
             raise
 
     def create_log_folder(self) -> None:
@@ -246,6 +271,7 @@ class MetaExperimentManager(ExperimentManager):
             done = model.num_timesteps
         log_interval = {-1: 1}.get(self.log_interval, self.log_interval if self.log_interval > 0 else None)
         with contextlib.ExitStack() as on_failure, _soft_interrupt(self._checkpointing):
+            assert self._lock is not None
             on_failure.callback(self._lock.release)
             try:
                 n_steps = max(int(self.n_timesteps) - done, 0)
@@ -307,6 +333,7 @@ class MetaExperimentManager(ExperimentManager):
                 f"The last model could not be written to {self.save_path} ({reason(error)}): mend that, and {again}."
             ) from error
         finally:
+            assert self._lock is not None
             self._lock.release()
 
     def objective(self, trial: optuna.Trial) -> float:
