@@ -102,15 +102,19 @@ class Driver:
         :return: progress: done, running, time left. Env steps are what is counted, up to the latest checkpoints
         """
         total, now = sum(cell.n_timesteps for cell in self.cells), time.monotonic()
-        left = sum(max(cell.n_timesteps - self.n_steps(cell), 0) for cell in todo)
+        left = self._n_steps_left(todo)
+        given_up = self._n_steps_left([cell for cell in self.cells if cell.name in self.failed])
         start, before = self._start = self._start or (now, left)
         n_running = sum(self.is_claimed(cell) for cell in todo)
         parts = [f"{len(self.cells) - len(todo) - len(self.failed)} of {len(self.cells)} cells done", f"{n_running} running"]
         parts += [f"{len(self.failed)} failed"] if self.failed else []
-        parts += [f"{100 * (total - left) // max(total, 1)} % of the env steps"]
+        parts += [f"{100 * (total - left - given_up) // max(total, 1)} % of the env steps"]
         if left < before:
             parts += [f"{timedelta(seconds=round(left * (now - start) / (before - left)))} left"]
         return ", ".join(parts)
+
+    def _n_steps_left(self, cells: Sequence[Cell]) -> int:
+        return sum(max(cell.n_timesteps - self.n_steps(cell), 0) for cell in cells)
 
     def _look(self) -> list[Cell]:
         start = time.monotonic()

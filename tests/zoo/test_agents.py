@@ -55,6 +55,29 @@ def test_agents_are_found_by_run_file_and_env(run: Path, tiny_pearl: MakePEARL, 
     assert agent_at(loose, env_id=ENV_ID).env_id == ENV_ID
 
 
+def test_a_run_without_a_model_is_left_out(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As one that was killed before its first evaluation."""
+    unfinished = run_folder(tmp_path / "logs", number=2)
+    unfinished.mkdir()
+    shutil.copy(run / RECORD, unfinished / RECORD)
+    with pytest.raises(FileNotFoundError, match=r"_2 has no model yet, .*: train anew, as it has no checkpoint either"):
+        agent_at(unfinished)
+    assert agent_at(tmp_path / "logs").folder == run
+    assert f"{unfinished} has no model yet, and is left out." in capsys.readouterr().err
+
+
+def test_a_folder_of_seeds_is_one_curve_whatever_else_is_in_it(
+    run: Path, tiny_pearl: MakePEARL, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = make_run(tmp_path / "logs", tiny_pearl(), number=2)
+    returns = np.arange(2.0)[:, None, None] * np.ones((2, 20, 4))
+    for folder in (run, other):
+        np.savez(folder / "evaluations.npz", timesteps=[480, 960], returns=returns, successes=returns > 0.5)
+    shutil.copy(run / "best_model.zip", tmp_path / "logs" / "backup.zip")
+    assert main(["plot", str(tmp_path / "logs"), "--only", "learning", "-o", str(tmp_path / "plots")]) == 0
+    assert "(2 of 2 runs learnt; their median)" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("more", [["--exp-id", "7"], ["--method", "rl2"]])
 def test_what_chooses_nothing_is_refused(run: Path, more: list[str]) -> None:
     with pytest.raises(ValueError, match="says which agent, so --exp-id and --method choose nothing"):

@@ -111,7 +111,7 @@ def main(argv: Sequence[str]) -> None:
     if alone:
         return
     exported = dataclasses.replace(agent, path=file, record=record, folder=None)
-    model, env = exported.load(), exported.make_vec_env(N_ENVS)
+    model, env = exported.load(args.device), exported.make_vec_env(N_ENVS)
     tasks = get_task_family(env).test_tasks
     explorers = dict.fromkeys([model.explorer.name, *exported.algorithm.also_explores_by])
     scores = {explorer: record_adaptation(model, env, tasks, args.n_episodes, explorer=explorer) for explorer in explorers}

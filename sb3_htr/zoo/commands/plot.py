@@ -18,7 +18,7 @@ from sb3_htr.zoo.commands.arguments import add_adaptation_arguments, add_agent_a
 from sb3_htr.zoo.plots.adaptation import plot_adaptation_curve, plot_adaptation_paths, start_position
 from sb3_htr.zoo.plots.curves import Curve, plot_curves
 from sb3_htr.zoo.plots.latent import plot_latent_space
-from sb3_htr.zoo.run.agents import RECORD, TrainedAgent, find_runs
+from sb3_htr.zoo.run.agents import RECORD, TrainedAgent, runs_with_models
 from sb3_htr.zoo.run.time_to_learned import time_to_learned
 
 EXAMPLE = """  sb3-htr plot --env SparsePointRobot-v0                  an agent that comes with the package
@@ -106,7 +106,7 @@ def groups_of(parser: argparse.ArgumentParser, args: argparse.Namespace) -> dict
     groups: dict[str, list[TrainedAgent]] = {}
     for label, path in zip(labels, args.agent or [None], strict=True):
         is_folder_of_runs = path is not None and path.is_dir() and any(path.rglob(RECORD))
-        paths = find_runs(path) if is_folder_of_runs else [path]
+        paths = runs_with_models(path) if is_folder_of_runs else [path]
         groups[label] = [chosen_agent(parser, args, path) for path in paths]
         check_same_settings(label, groups[label])
     envs = {agent.env_id for agents in groups.values() for agent in agents}
@@ -172,13 +172,13 @@ def print_time_to_learned(groups: dict[str, list[TrainedAgent]]) -> None:
         times = [time for agent in agents if agent.folder is not None and (time := time_to_learned(agent.folder)) is not None]
         if times:
             learnt = [time for time in times if np.isfinite(time[0])]
-            runs = f" (median of {len(learnt)} runs of {len(times)} that learnt)" if len(times) > 1 else ""
+            runs = f" ({len(learnt)} of {len(times)} runs learnt; their median)" if len(times) > 1 else ""
             if learnt:
                 steps, seconds = np.median(learnt, axis=0)
                 clock = "" if np.isnan(seconds) else f", {seconds:,.0f} seconds with evaluations"
                 print(f"{label}: 95 % of the way to its last return after {steps:,.0f} env steps{clock}{runs}")
             else:
-                print(f"{label}: nothing learnt, the last evaluation is the lowest")
+                print(f"{label}: nothing learnt, the last evaluation is the lowest of each run")
 
 
 def main(argv: Sequence[str]) -> None:

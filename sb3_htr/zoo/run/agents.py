@@ -4,6 +4,7 @@ import contextlib
 import difflib
 import json
 import os
+import sys
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr.common.checks import check_device
 from sb3_htr.common.errors import last_line
+from sb3_htr.common.resume import checkpoints
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.zoo.run.algorithm import Algorithm, Model
 from sb3_htr.zoo.run.folder import run_number
@@ -196,6 +198,20 @@ def find_run(folder: Path) -> Path:
     return find_runs(folder)[-1]
 
 
+def runs_with_models(folder: Path) -> list[Path]:
+    """
+    :param folder: a run folder, or a folder with runs somewhere in it
+    :return: those that have a model, the oldest first, and the others are told of; all, if none has one
+    :raises FileNotFoundError: if there is no run
+    """
+    runs = find_runs(folder)
+    having = [run for run in runs if any(run.glob("[!.]*.zip"))]  # hidden ones are what a killed process left
+    for run in runs if having else []:
+        if run not in having:
+            print(f"{run} has no model yet, and is left out.", file=sys.stderr)
+    return having or runs
+
+
 def find_model(run: Path, env_id: str, which: str) -> Path:
     """
     :param run: run folder
@@ -208,9 +224,8 @@ def find_model(run: Path, env_id: str, which: str) -> Path:
     for path in (best, last) if which == "best" else (last, best):
         if path.exists():
             return path
-    raise FileNotFoundError(
-        f"{run} has no model yet, the first is saved with the first evaluation: go on with `sb3-htr train --resume {run}`."
-    )
+    advice = f"go on with `sb3-htr train --resume {run}`" if checkpoints(run) else "train anew, as it has no checkpoint either"
+    raise FileNotFoundError(f"{run} has no model yet, the first is saved with the first evaluation: {advice}.")
 
 
 def agent_at(
@@ -230,7 +245,7 @@ def agent_at(
     if len(files) == 1 and not any(path.rglob(RECORD)):
         path = files[0]
     if path.is_dir():
-        run = find_run(path)
+        run = runs_with_models(path)[-1]
         record = read_record(run / RECORD)
         return TrainedAgent(find_model(run, record["env_id"], which), record, run, trust)
     if not path.exists():
