@@ -14,7 +14,7 @@ DOCUMENTS = (RESULTS.parent / "README.md", RESULTS.parent / "docs" / "results.md
 HEADLINE = {
     "point_robot": ("htr-ser", "pearl-dense", "pearl-sparse"),
     "prior": ("htr-ser-prior", "pearl-dense-prior"),
-    "wheeled": ("htr-ser",),
+    "wheeled": ("htr-ser", "pearl-dense"),
     "ant": ("htr-ser",),
     "fetch_reach": ("htr-ser", "pearl-sparse"),
     "fetch_push": ("htr-ser", "pearl-sparse"),
