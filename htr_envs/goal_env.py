@@ -298,8 +298,8 @@ def hide_goal(env_id: str, **env_kwargs: Any) -> str:
     # the registration, not its id: in a process of its own the registry may not have it
     known = gym.registry.get(hidden_id)
     steps = spec.max_episode_steps
-    is_known = known is not None and known.max_episode_steps == steps
-    if known is None or not is_known or GoalEnvSource.find(known.kwargs["env_id"], {}) != GoalEnvSource.find(spec, {}):
+    own = GoalEnvSource.find(spec, {})
+    if known is None or known.max_episode_steps != steps or GoalEnvSource.find(known.kwargs["env_id"], {}) != own:
         register(hidden_id, "htr_envs.goal_env:HiddenGoalEnv", max_episode_steps=steps, kwargs={"env_id": spec})
     return hidden_id
 

@@ -124,6 +124,9 @@ def test_progress_counts_cells_and_env_steps(tmp_path: Path, monkeypatch: pytest
         # The last rollout goes beyond the budget, and the evaluation is still to come
         (running.run_folder(tmp_path) / "htr-ec/run_1/checkpoints/1200_steps").mkdir()
         assert driver.line(driver.todo()) == "1 of 6 cells done, 1 running, 33 % of the env steps, 0:02:00 left"
+    # What was given up is not done
+    driver.failed[CELLS[2].name] = "no luck"
+    assert "1 of 6 cells done, 0 running, 1 failed, 33 % of the env steps" in driver.line(driver.todo())
 
 
 def test_a_node_that_sees_another_folder_is_found_out(trains: Any, tmp_path: Path) -> None:

@@ -46,6 +46,18 @@ def test_without_successes_no_picture_says_how_well_they_are_predicted(tmp_path:
     assert not (tmp_path / "reliability.png").exists()
 
 
+@pytest.mark.parametrize("name", ["point_robot", "rivals", "relabelling"])
+def test_a_run_may_have_an_evaluation_more_than_others(name: str, tmp_path: Path) -> None:
+    """As where rollouts are longer than the time between two."""
+    results = made_up(EXPERIMENTS[name].cells(2), tmp_path)
+    for path in [*results.values()][: len(results) // 2]:
+        raw = dict(np.load(path))
+        longer = {key: np.concatenate([raw[key], raw[key][-1:]]) for key in ("timesteps", "curve", "solved", "elapsed_s")}
+        np.savez(path, **{**raw, **longer})
+    EXPERIMENTS[name].figure(results, tmp_path / "picture.png")
+    assert (tmp_path / "picture.png").exists()
+
+
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     experiment, folder = EXPERIMENTS[name], tmp_path / "results"

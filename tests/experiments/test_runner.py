@@ -13,6 +13,7 @@ import yaml
 from helpers import ENV_ID
 from sb3_htr import PEARL, evaluate_adaptation, make_task_vec_env
 from sb3_htr.adaptation.explorers import Prior
+from sb3_htr.common.checkpoint import write_checkpoint
 from sb3_htr.common.resume import checkpoints
 from sb3_htr.experiments import grid
 from sb3_htr.experiments.cell import Cell
@@ -80,6 +81,21 @@ def test_a_killed_run_goes_on_and_a_finished_one_is_tested(tmp_path: Path, monke
     with pytest.raises(ValueError, match=r"has batch_size 4, but .* needs 5"):
         find_finished(replace(others, settings={**SMALL, "batch_size": 5}), folder)
     assert find_finished(replace(others, n_timesteps=1200), tmp_path / "nowhere") is None
+
+
+def test_a_last_checkpoint_that_cannot_be_written_is_no_interrupt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The grid goes on with its other cells, and says why this one did not end."""
+    (cell,) = Experiment("one", "", ENV_ID, 960, (Variant("htr-ser", "", SMALL, {"n_test_tasks": 4}),), 1, 480).cells()
+
+    def write_unless_last(folder: Path, state: dict[str, Any]) -> None:
+        if state["model"]["counters"]["num_timesteps"] >= 960:
+            raise OSError(28, "No space left on device")
+        write_checkpoint(folder, state)
+
+    monkeypatch.setattr("sb3_htr.common.resume.write_checkpoint", write_unless_last)
+    train.main([*cell.training(cell.run_folder(tmp_path)), "--save-freq", "1"])
+    with pytest.raises(OSError, match="has its last model, but its last checkpoint could not be written"):
+        run_cell(cell, tmp_path)
 
 
 def test_the_command_repeats_an_experiment(

@@ -121,6 +121,20 @@ def test_a_task_space_can_bring_its_own_discretiser() -> None:
     assert by_quadrant.n_hindsight_buffers <= 9
 
 
+def test_a_discretiser_of_another_dtype_goes_on_with_the_buffers_that_there_are() -> None:
+    def rounded(tasks: np.ndarray) -> np.ndarray:
+        return np.round(tasks.astype(np.float64) / 0.1) * 0.1
+
+    buffer, relabeller = filled(discretiser=rounded)
+    resumed, its_relabeller = filled(0, discretiser=rounded)
+    resumed.load_state_dict(buffer.state_dict())
+    for each in (buffer, resumed):
+        rng = np.random.default_rng(1)
+        for _ in range(20):
+            add_episode(each, [1, 2], 20, rng)
+    assert relabeller.n_hindsight_buffers == its_relabeller.n_hindsight_buffers > 1
+
+
 def test_pearl_trains_with_it(tiny_pearl: MakePEARL) -> None:
     model = tiny_pearl(replay_buffer_kwargs={"relabeller": {"name": "EpisodeClustering", "cell_size": 0.1}}).learn(480)
     assert model.replay_buffer is not None

@@ -15,9 +15,11 @@ from helpers import ENV_ID, TINY, MakePEARL
 from helpers.runs import make_run, run_folder, train_arguments
 from sb3_htr import PEARL
 from sb3_htr.adaptation import Belief, Prior
+from sb3_htr.adaptation.explorers import to_explorer
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run.agents import RECORD, agent_for
 from sb3_htr.zoo.run.method import PEARLMethod, get_method, merged, methods
+from sb3_htr.zoo.run.shipped import hyperparams_file
 
 OWN = ["htr-ser", "htr-ec", "pearl-dense", "pearl-sparse", "htr-hfr", "htr-hipi"]
 OTHERS = ["rl2", "sac-her"]
@@ -84,6 +86,18 @@ def test_the_second_wins_and_nothing_else_of_the_first_is_lost(first: dict[str, 
         assert hidden or result[path] == value
     assert result.keys() <= {*ours, *theirs, ()}
     assert (first, second) == before, "neither is changed"
+
+
+@pytest.mark.parametrize("env_id", ["SparsePointRobot-v0", "SparseWheeled-v0", "SparseAnt-v0"])
+def test_settings_of_an_explorer_are_for_it_alone(env_id: str) -> None:
+    """`pearl_paper.yml` has some of `prior` for the robots, which other methods' explorers have not."""
+    blocks = yaml.safe_load(hyperparams_file("pearl_paper.yml").read_text())
+    of_env = blocks.get(env_id, blocks["default"])
+    for name in ("htr-ser", "htr-ser-prior"):
+        settings = get_method(name).settings(of_env)
+        assert to_explorer(settings["train_explorer"]).name == ("prior" if name.endswith("prior") else "aggregate")
+    with pytest.raises(ValueError, match="has no setting 'n_exploration_episode'"):
+        to_explorer(get_method("htr-ser-prior").settings({"explorer": {"n_exploration_episode": 2}})["explorer"])
 
 
 def test_a_name_and_settings_of_what_it_names_are_joined() -> None:

@@ -206,10 +206,12 @@ def runs_with_models(folder: Path) -> list[Path]:
     """
     runs = find_runs(folder)
     having = [run for run in runs if any(run.glob("[!.]*.zip"))]  # hidden ones are what a killed process left
-    for run in runs if having else []:
+    if not having:
+        return runs
+    for run in runs:
         if run not in having:
             print(f"{run} has no model yet, and is left out.", file=sys.stderr)
-    return having or runs
+    return having
 
 
 def find_model(run: Path, env_id: str, which: str) -> Path:

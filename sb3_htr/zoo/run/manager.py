@@ -107,7 +107,6 @@ class MetaExperimentManager(ExperimentManager):
         if self.resumed is not None:  # what a user gave comes from a file now
             given = checked(given, self.resumed / RECORD)
         self._given = given
-        self._check_study()
         hyperparams = merged(merged(hyperparams, checked(self._trial(trial_id), self.storage)), given)
         if self.n_timesteps > 0:
             hyperparams["n_timesteps"] = self.n_timesteps
@@ -122,8 +121,7 @@ class MetaExperimentManager(ExperimentManager):
 
     def _check_study(self) -> None:
         """Trials of several envs or methods have no best one, and settings of one are none of another."""
-        if self.storage is None or self.study_name is None:
-            return
+        assert self.storage is not None
         storage = JournalStorage(JournalFileBackend(self.storage)) if self.storage.endswith(".log") else self.storage
         try:
             study = optuna.load_study(study_name=self.study_name, storage=storage)
@@ -142,12 +140,15 @@ class MetaExperimentManager(ExperimentManager):
     def _trial(self, trial_id: int | None) -> dict[str, Any]:
         named = {"--storage": self.storage, "--study-name": self.study_name, "--trial-id": trial_id}
         missing = [option for option, value in named.items() if value is None]
+        if self.optimize_hyperparameters and self.storage is not None:
+            self._check_study()
         if len(missing) == 3 or self.optimize_hyperparameters:
             return {}
         if missing or trial_id is None or trial_id < 0:
             add = ", ".join(missing) or "another number"
             raise ValueError(f"A trial is named by {', '.join(named)}, from 0 on: add {add}.")
         assert self.storage is not None and self.study_name is not None
+        self._check_study()
         try:
             trial: dict[str, Any] = self.load_trial(self.storage, self.study_name, trial_id)
         except (KeyError, IndexError):

@@ -94,10 +94,10 @@ class PEARLMethod(Method):
             relabeller = {key: value for key, value in buffer["relabeller"].items() if key not in of_others}
             of_env = {**of_env, "replay_buffer_kwargs": {**buffer, "relabeller": relabeller}}
         for key in ("explorer", "train_explorer"):
-            # Nor those for other explorers about this one
             if isinstance(of_env.get(key), dict) and getattr(self, key) in EXPLORERS:
-                own = keywords_of(EXPLORERS[getattr(self, key)])
-                of_env = {**of_env, key: {name: value for name, value in of_env[key].items() if name in {"name", *own}}}
+                # Nor those for other explorers
+                of_others = set().union(*map(keywords_of, EXPLORERS.values())) - keywords_of(EXPLORERS[getattr(self, key)])
+                of_env = {**of_env, key: {name: value for name, value in of_env[key].items() if name not in of_others}}
         return merged(of_env, self.hyperparams())
 
     def relabeller_settings(self) -> set[str]:
