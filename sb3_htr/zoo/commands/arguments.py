@@ -10,6 +10,7 @@ from typing import Any
 from htr_envs.goal_env import find_hidden
 from sb3_htr.adaptation.evaluation import TASK_SETS
 from sb3_htr.adaptation.explorers import EXPLORERS
+from sb3_htr.common.checks import check_device
 from sb3_htr.zoo.run.agents import TrainedAgent, agent_at, agent_for
 from sb3_htr.zoo.run.trust import check_env_kwargs, import_packages, refuse
 
@@ -95,8 +96,9 @@ def chosen_agent(parser: argparse.ArgumentParser, args: argparse.Namespace, path
     :param args: of :func:`add_agent_arguments`
     :param path: what was given as agent, if anything
     :return: the agent; its env is registered
-    :raises ValueError: if arguments contradict each other
+    :raises ValueError: if arguments contradict each other, or the device cannot be used
     """
+    check_device(args.device)
     import_packages(args.gym_packages)
     if path is not None:
         if args.exp_id or args.method:
