@@ -135,6 +135,17 @@ def test_a_discretiser_of_another_dtype_goes_on_with_the_buffers_that_there_are(
     assert relabeller.n_hindsight_buffers == its_relabeller.n_hindsight_buffers > 1
 
 
+def test_hindsight_buffers_of_another_grid_are_refused() -> None:
+    saved = filled(cell_size=0.1)[0].state_dict()
+    buffer, relabeller = filled(0, cell_size=0.15)
+    with pytest.raises(ValueError, match=r"of another grid than that of cell_size 0\.15.*make the model with"):
+        buffer.load_state_dict(saved)
+    assert relabeller.n_hindsight_buffers == 0 == buffer.size()
+    buffer, relabeller = filled(0, cell_size=0.1)
+    buffer.load_state_dict(saved)
+    assert relabeller.n_hindsight_buffers > 1
+
+
 def test_pearl_trains_with_it(tiny_pearl: MakePEARL) -> None:
     model = tiny_pearl(replay_buffer_kwargs={"relabeller": {"name": "EpisodeClustering", "cell_size": 0.1}}).learn(480)
     assert model.replay_buffer is not None

@@ -97,8 +97,15 @@ class EpisodeClustering(HindsightBuffers):
         return {**super().state_dict(), "tasks": th.from_numpy(np.array(self._tasks, dtype=np.float32))}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
+        tasks = state["tasks"].numpy().copy()
+        # Those of another grid would stay, and be drawn beside the cells of this one
+        if isinstance(self.discretiser, GridDiscretiser) and len(tasks) and (self.discretiser(tasks) != tasks).any():
+            raise ValueError(
+                f"The hindsight buffers that were saved are of another grid than that of cell_size "
+                f"{self.discretiser.cell_size.tolist()}: make the model with the cell_size that they were saved with."
+            )
         super().load_state_dict(state)
-        self._tasks = list(state["tasks"].numpy().copy())
+        self._tasks = list(tasks)
         self._buffer_of = {task.tobytes(): i for i, task in enumerate(self._tasks)}
 
     def on_episode(self, task: int, episode: np.ndarray) -> None:
