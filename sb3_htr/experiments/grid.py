@@ -165,6 +165,9 @@ def settings_of(file: str) -> KwArgs:
     return {key: value for key, value in block.items() if key not in ("policy", "method", "n_timesteps")}
 
 
+# PEARL's methods on robots; the budgets of the two others are those of their YAML files
+ON_ROBOTS = tuple(map(Variant, ("htr-ser", "pearl-dense", "pearl-sparse", "htr-hfr", "htr-hipi")))
+
 ALL = (
     Experiment(
         "point_robot",
@@ -211,19 +214,19 @@ ALL = (
     ),
     Experiment(
         "wheeled",
-        "HTR on a robot with wheels, against PEARL with a dense proxy reward and with the sparse one.",
+        "HTR on a robot with wheels, against other rewards, other ways to relabel and to adapt, and an agent that is told more.",
         WHEELED,
         600_000,
-        tuple(map(Variant, ("htr-ser", "pearl-dense", "pearl-sparse"))),
+        (*ON_ROBOTS, Variant("rl2", budget=10), Variant("sac-her", budget=0.5)),
         eval_freq=50_000,
         evaluations=OF_ROBOTS,
     ),
     Experiment(
         "ant",
-        "HTR on a robot with legs, against PEARL with a dense proxy reward and with the sparse one.",
+        "HTR on a robot with legs, against the same.",
         ANT,
         600_000,
-        tuple(map(Variant, ("htr-ser", "pearl-dense", "pearl-sparse"))),
+        (*ON_ROBOTS, Variant("rl2", budget=10), Variant("sac-her")),
         eval_freq=100_000,
         evaluations=OF_ROBOTS,
     ),
