@@ -214,7 +214,7 @@ ALL = (
     ),
     Experiment(
         "wheeled",
-        "HTR on a robot with wheels, against other rewards, other ways to relabel and to adapt, and an agent that is told more.",
+        "HTR on a robot with wheels, against other rewards, other ways to relabel and to adapt, and one that is told more.",
         WHEELED,
         600_000,
         (*ON_ROBOTS, Variant("rl2", budget=10), Variant("sac-her", budget=0.5)),
