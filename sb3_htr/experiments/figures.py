@@ -1,5 +1,6 @@
 """The pictures of experiments, from the raw results of their cells."""
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -149,7 +150,12 @@ def goal_distance(results: Results, path: Path) -> None:
     groups = by_variant(results, and_env=False)
     for colour, (variant, runs) in zip(curve_colours([*groups]), groups.items(), strict=True):
         x = sorted({cell.env_kwargs["goal_distance"] for cell, _ in runs})
-        ordered = sorted(runs, key=lambda run: (run[0].env_kwargs["goal_distance"], run[0].seed))
+        # A line is of the seeds that have been run at each distance
+        n_distances = Counter(cell.seed for cell, _ in runs)
+        ordered = [run for run in runs if n_distances[run[0].seed] == len(x)]
+        if not ordered:
+            continue
+        ordered.sort(key=lambda run: (run[0].env_kwargs["goal_distance"], run[0].seed))
         optimum = [optimal_return(**cell.env_kwargs) for cell, _ in ordered]
         for axes, metric in ((left, "last_episode_return"), (right, "success_rate")):
             values = scores([raw for _, raw in ordered], metric, "belief")
@@ -177,7 +183,11 @@ def relabelling(results: Results, path: Path) -> None:
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
     probabilities = sorted(float(variant.removeprefix("K = ")) for variant in groups if variant.startswith("K = "))
     returns = [scores(groups[f"K = {k:g}"], "last_episode_return", "belief") for k in probabilities]
-    band(left, np.array(probabilities), np.stack(returns, axis=-1), COLOURS[0], "-", "IQM and 95 % interval")
+    # A band needs as many runs of each
+    n = min(map(len, returns), default=0)
+    if n:
+        heights = np.stack([values[:n] for values in returns], axis=-1)
+        band(left, np.array(probabilities), heights, COLOURS[0], "-", "IQM and 95 % interval")
     for k, values in zip(probabilities, returns, strict=True):
         label = "one seed" if k == 0 else None
         left.plot([k] * len(values), values.mean(axis=(1, 2)), "o", color=COLOURS[6], markersize=3, label=label)

@@ -1,6 +1,7 @@
 """From raw results to tables and pictures. The runs are made up; what is said of them must be true."""
 
 import json
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,34 +10,12 @@ import numpy as np
 import pytest
 import tables
 
+from helpers.results import made_up
 from sb3_htr.experiments import figures, report
-from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.grid import EXPERIMENTS, Experiment, Variant
-from sb3_htr.experiments.protocol import EVAL_SEEDS, METRICS
+from sb3_htr.experiments.protocol import METRICS
 from sb3_htr.experiments.runner import LOGGED
 from sb3_htr.zoo.run.method import methods
-
-
-def made_up(cells: list[Cell], folder: Path) -> dict[Cell, Path]:
-    """Every test task of a run returns the number of its seed in the last episode, and solves the task from the third on."""
-    results = {}
-    for cell in cells:
-        arrays: dict[str, Any] = {
-            "timesteps": np.arange(1, 5) * 1000,
-            "curve": np.ones((4, 20)) * [[1], [5], [4], [4.5]],
-            "solved": np.arange(20) < np.array([[0], [15], [16], [20]]),
-            "elapsed_s": np.arange(1.0, 5.0),
-        }
-        arrays |= {"cell": cell.facts(), "commit": "abc", "evaluation_commit": "abc", **{key: 0.5 for key in LOGGED}}
-        arrays["calibration"] = np.tile([[4.0, 1.0, 2.0]], (10, 1))
-        for evaluation in cell.evaluations:
-            returns = float(cell.seed + len(evaluation.tested_on))
-            arrays[f"returns_{evaluation.name}"] = np.full((len(EVAL_SEEDS), 20, 6), returns, dtype=np.float32)
-            arrays[f"successes_{evaluation.name}"] = np.broadcast_to(np.arange(6) >= 2, (len(EVAL_SEEDS), 20, 6))
-        results[cell] = folder / f"{cell.name}.npz"
-        np.savez(results[cell], **arrays)
-    assert len({cell.name for cell in cells}) == len(cells), "two runs of one name would overwrite each other"
-    return results
 
 
 def test_without_successes_no_picture_says_how_well_they_are_predicted(tmp_path: Path) -> None:
@@ -44,6 +23,21 @@ def test_without_successes_no_picture_says_how_well_they_are_predicted(tmp_path:
     np.savez(path, **{**np.load(path), "calibration": np.zeros((10, 3))})
     figures.reliability({cell: path}, tmp_path / "reliability.png")
     assert not (tmp_path / "reliability.png").exists()
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+@pytest.mark.parametrize("chosen", [slice(-1, None), slice(1, None, 2)], ids=["the last run", "every other run"])
+def test_what_is_finished_of_an_experiment_is_reported_alone(
+    name: str, chosen: slice, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 50)
+    experiment = EXPERIMENTS[name]
+    finished = experiment.cells(3)[chosen]
+    report.write("command", experiment, made_up(finished, tmp_path), tmp_path / "results")
+    rows = json.loads((tmp_path / "results" / "summary.json").read_text())["rows"]
+    runs = Counter((cell.variant, str(cell.env_kwargs)) for cell in finished)
+    assert {(row["variant"], str(row["env_kwargs"])): row["n_seeds"] for row in rows} == runs
+    assert (tmp_path / "results" / f"{experiment.name}.png").exists()
 
 
 @pytest.mark.parametrize("name", ["point_robot", "rivals", "relabelling"])

@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from helpers import ENV_ID
+from helpers.results import made_up
 from sb3_htr import PEARL, evaluate_adaptation, make_task_vec_env
 from sb3_htr.adaptation.explorers import Prior
 from sb3_htr.common.checkpoint import write_checkpoint
@@ -203,6 +204,27 @@ def test_one_cell_of_a_job_array_writes_no_tables(tmp_path: Path, monkeypatch: p
     assert ran == [("htr-ser-seed2", tmp_path / "here")] and not Path("results").exists()
     with pytest.raises(ValueError, match="--cell is 2, expected 0 to 1"):
         main(["experiment", "pair", "--cell", "2"])
+
+
+def test_results_of_what_is_finished_are_written_without_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pair = Experiment("pair", "", ENV_ID, 480, (Variant("htr-ser"),), 2, eval_freq=240, evaluations=by(("prior",)))
+    monkeypatch.setitem(grid.EXPERIMENTS, "pair", pair)
+    monkeypatch.setattr("sb3_htr.experiments.driver.Driver", None)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=r"No run of pair is finished in .*runs: run it without --finished"):
+        main(["experiment", "pair", "--finished"])
+    assert not Path("results").exists()
+    second = pair.cells()[1]
+    second.result(Path("runs")).parent.mkdir(parents=True)
+    made_up([second], second.result(Path("runs")).parent)
+    assert main(["experiment", "pair", "--finished"]) == 0
+    assert "1 of 2 runs are finished." in capsys.readouterr().out
+    summary = json.loads(Path("results", "pair", "summary.json").read_text())
+    assert {row["n_seeds"] for row in summary["rows"]} == {1} and summary["command"] == "sb3-htr experiment pair --seeds 2"
+    with pytest.raises(SystemExit):
+        main(["experiment", "pair", "--finished", "--cell", "1"])
 
 
 def test_runs_in_an_object_store_are_refused() -> None:

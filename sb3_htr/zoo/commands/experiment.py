@@ -6,6 +6,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.zoo.commands.arguments import OF_PACKAGES, make_parser
@@ -13,7 +14,8 @@ from sb3_htr.zoo.run.trust import import_packages
 
 EXAMPLE = """  sb3-htr experiment point_robot --jobs 2
   sb3-htr experiment ant --quick                        one seed, a tenth of the env steps: does it run?
-  sb3-htr experiment ant --ray auto --runs /shared/runs      on a Ray cluster"""
+  sb3-htr experiment ant --ray auto --runs /shared/runs      on a Ray cluster
+  sb3-htr experiment ant --finished                     tables and pictures, of what has been run so far"""
 
 
 def main(argv: Sequence[str]) -> None:
@@ -40,6 +42,7 @@ def main(argv: Sequence[str]) -> None:
     where.add_argument("--jobs", type=int, default=2, help="runs at a time, each on one thread (default: 2)")
     where.add_argument("--ray", metavar="ADDRESS", help="run on a Ray cluster; auto for the one of this machine")
     where.add_argument("--cell", type=int, metavar="I", help="run number I alone, from 0, for job arrays; writes no results")
+    where.add_argument("--finished", action="store_true", help="train nothing: results of the runs that are finished")
     args = parser.parse_args(argv)
     given = {"--seeds": args.seeds, "--jobs": args.jobs}
     check_numbers(**{name: (n, 1) for name, n in given.items() if n is not None})
@@ -53,18 +56,31 @@ def main(argv: Sequence[str]) -> None:
     quick = "quick-" if args.quick else ""
     runs = (args.runs / "quick" if args.quick else args.runs).resolve()
     chosen = cells if args.cell is None else [cells[args.cell]]
-    report.check({cell: path for cell in chosen if (path := cell.result(runs)).exists()})
-    try:
+    report.check(finished(chosen, runs))
+    if not args.finished:
+        here = executors.Here() if args.cell is not None else executors.Processes(args.jobs)
+        try:
+            driver.Driver(chosen, runs, executors.Ray(args.ray) if args.ray else here).run()
+        except KeyboardInterrupt:
+            print(f"\nStopped. What ran goes on from its checkpoint in {runs} with the same command.", file=sys.stderr)
+            raise SystemExit(130) from None
         if args.cell is not None:
-            driver.Driver(chosen, runs, executors.Here()).run()
             return
-        driver.Driver(cells, runs, executors.Ray(args.ray) if args.ray else executors.Processes(args.jobs)).run()
-    except KeyboardInterrupt:
-        print(f"\nStopped. What ran goes on from its checkpoint in {runs} with the same command.", file=sys.stderr)
-        raise SystemExit(130) from None
+    results = finished(cells, runs)
+    if not results:
+        raise ValueError(f"No run of {args.name} is finished in {runs}: run it without --finished, or name other --runs.")
+    print(f"{len(results)} of {len(cells)} runs are finished.")
     output = args.output or Path("results", quick + args.name)
     how = ("--quick " if args.quick else "") + f"--seeds {len({cell.seed for cell in cells})}"
     how += f" --gym-packages {' '.join(packages)}" if packages else ""
-    results = {cell: cell.result(runs) for cell in cells}
     report.write(f"sb3-htr experiment {args.name} {how}", experiment, results, output)
     print(f"Results: {output}")
+
+
+def finished(cells: Sequence[Any], runs: Path) -> dict[Any, Path]:
+    """
+    :param cells: of an experiment
+    :param runs: folder of all experiments' runs
+    :return: raw results of those that have one there
+    """
+    return {cell: path for cell in cells if (path := cell.result(runs)).exists()}
