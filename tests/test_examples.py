@@ -26,7 +26,11 @@ FAMILIES = {
 }
 
 
-DENSE = {"half_cheetah_velocity": "HalfCheetahVelocity-v0", "dense_point_robot": "DensePointRobot-v0"}
+DENSE = {
+    "half_cheetah_velocity": "HalfCheetahVelocity-v0",
+    "ant_direction": "AntDirection-v0",
+    "dense_point_robot": "DensePointRobot-v0",
+}
 DEPENDENT = {**DENSE, "walker_random_params": "WalkerRandomParams-v0"}
 
 
