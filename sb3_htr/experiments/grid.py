@@ -223,7 +223,7 @@ ALL = (
     ),
     Experiment(
         "ant",
-        "HTR on a robot with legs, against the same.",
+        "HTR on a robot with legs, against other rewards, other ways to relabel and to adapt, and one that is told more.",
         ANT,
         600_000,
         (*ON_ROBOTS, Variant("rl2", budget=10), Variant("sac-her")),
