@@ -76,7 +76,7 @@ class PEARL(OffPolicyMetaAlgorithm):
         ``{"name": "prior", "n_exploration_episodes": 9}``
     :param train_explorer: the same for rollouts
     :param matmul_precision: of matrix products in updates, as for ``torch.set_float32_matmul_precision``. ``"medium"`` rounds
-        their factors to bfloat16, which on hardware that has it takes half the time
+        their factors to bfloat16, which is faster where the processor has such products (docs/performance.md)
     :param stats_window_size: episodes over which logged returns are averaged
     :param tensorboard_log: folder for TensorBoard, none by default
     :param policy_kwargs: arguments of the policy: ``latent_dim``, ``net_arch``, ``encoder_arch`` (paper: 5, 3x300, 3x200),
