@@ -782,3 +782,102 @@ def test_a_step_of_all_envs_tells_of_each(tiny_pearl: MakePEARL, monkeypatch: py
         ValueError, match=r"expected arrays of the shapes \(\(4, 2\), \(4,\), \(4,\)\), got \(\(4, 2\), \(\), \(4,\)\)"
     ):
         env.step(np.zeros((4, 2), dtype=np.float32))
+
+
+@pytest.mark.parametrize("lengths", [(20, 1000), (1000, 20)])
+def test_the_shortest_time_limit_around_an_env_is_the_one_that_counts(lengths: tuple[int, int], tiny_pearl: MakePEARL) -> None:
+    inner, outer = lengths
+    env = gym.wrappers.TimeLimit(gym.make(ENV_ID, max_episode_steps=inner), outer)
+    assert tiny_pearl(env, n_tasks_per_rollout=1).max_episode_steps == 20
+
+
+def test_the_longest_time_limit_of_several_envs_is_the_one_that_counts(tiny_pearl: MakePEARL) -> None:
+    env = DummyVecEnv([partial(gym.make, ENV_ID, max_episode_steps=length) for length in (10, 20, 10, 10)])
+    model = tiny_pearl(env).learn(ROLLOUT)
+    assert model.max_episode_steps == 20 and model._n_updates > 0
+
+
+def test_settings_of_another_time_limit_are_warned_of(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    tiny_pearl().save(tmp_path / "model")
+    longer = make_task_vec_env(ENV_ID, 4, env_kwargs={"max_episode_steps": 40})
+    with pytest.warns(UserWarning, match="time limit is 40 steps, and what follows from it is still of 20: .*gamma"):
+        PEARL.load(tmp_path / "model", env=longer)
+
+
+@pytest.mark.parametrize("total_timesteps", [-5, float("nan"), "1e5"])
+def test_a_budget_that_is_none(total_timesteps: Any, tiny_pearl: MakePEARL) -> None:
+    with pytest.raises(ValueError, match=r"total_timesteps is .*, expected a number of at least 0"):
+        tiny_pearl().learn(total_timesteps)
+    with pytest.raises(ValueError, match="log_interval is 0, expected a whole number of at least 1"):
+        tiny_pearl().learn(ROLLOUT, log_interval=0)
+
+
+def test_a_training_without_an_update_is_warned_of(tiny_pearl: MakePEARL) -> None:
+    with pytest.warns(UserWarning, match="Nothing was learnt: learning begins after 9999 env steps"):
+        tiny_pearl(learning_starts=9999).learn(ROLLOUT)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model = tiny_pearl().learn(ROLLOUT)
+        model.learn(0, reset_num_timesteps=False)
+
+
+def test_whole_numbers_are_no_actions(tiny_pearl: MakePEARL) -> None:
+    whole = spaces.Box(-1, 1, (2,), np.int64)
+    with pytest.raises(ValueError, match="has whole numbers, but actions are floats"):
+        tiny_pearl(WithSpaces(gym.make(ENV_ID), action_space=whole), n_tasks_per_rollout=1)
+    robot = Robot(20)
+    robot.action_space = whole
+    with pytest.raises(ValueError, match="has whole numbers, but actions are floats"):
+        tiny_pearl().adapt(robot)
+
+
+def test_no_action_follows_from_nothing(tiny_pearl: MakePEARL) -> None:
+    agent = tiny_pearl().adapt(Robot(20), n_episodes=1)
+    with pytest.raises(ValueError, match=r"The observation is \[nan  0\.\], expected finite numbers"):
+        agent.predict(np.array([np.nan, 0.0]))
+
+
+def test_an_env_that_is_refused_leaves_the_model_as_it_was(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    before = model.env
+    with pytest.raises(ValueError, match="The env has no task_family"):
+        model.set_env(DummyVecEnv([lambda: gym.wrappers.TimeLimit(Robot(20), 20)] * 4))
+    assert model.env is before and model.learn(ROLLOUT)._n_updates > 0
+
+
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [
+        ((np.zeros(3, dtype=np.float32), 0.0), "observations must have the shape of its observation_space"),
+        ((np.zeros(2, dtype=np.float32), np.zeros(2)), "an env's reward must be a number"),
+    ],
+)
+def test_a_robot_that_returns_something_else(returned: Any, message: str, tiny_pearl: MakePEARL) -> None:
+    robot = Robot(20)
+    robot.step = lambda action: (*returned, False, False, {})  # type: ignore[method-assign]
+    with pytest.raises(ValueError, match=message):
+        tiny_pearl().adapt(robot)
+
+
+@pytest.mark.parametrize("tasks", [[[0.0, 1.0]], np.zeros((0, 2)), np.zeros(3)])
+def test_training_tasks_that_are_no_array_of_tasks(tasks: Any, tiny_pearl: MakePEARL) -> None:
+    class Family(WithoutHook.Family):
+        train_tasks = tasks
+
+    env = WithoutHook(gym.make(ENV_ID))
+    env.task_family = Family()
+    with pytest.raises(ValueError, match=r"train_tasks are .*, expected an array \(n_tasks, task_dim\)"):
+        tiny_pearl(env, n_tasks_per_rollout=1)
+
+
+def test_an_evaluation_on_the_very_env_of_training(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    env = model.get_env()
+    assert env is not None
+    with pytest.raises(ValueError, match="eval_env is the env that is trained on"):
+        model.learn(ROLLOUT, MetaEvalCallback(env, n_eval_episodes=1))
+
+
+def test_a_model_needs_an_env_for_its_networks() -> None:
+    with pytest.raises(ValueError, match="PEARL has no env to make its networks for"):
+        PEARL("MlpPolicy", None)

@@ -126,6 +126,8 @@ class Adaptation:
         :param step: what each env did
         :raises ValueError: for arrays of other shapes, NaN and infinity, and actions that are not scaled
         """
+        obs, actions, rewards, next_obs, dones = map(np.asarray, step[:5])
+        step = Step(obs, actions, rewards, next_obs, dones, step.infos)
         if not self.is_training:  # what is collected is checked where it is stored
             self._check("observations", step.observations, self.policy.obs_dim)
             self._check("rewards", step.rewards)

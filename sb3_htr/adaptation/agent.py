@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.utils import get_device
 
 from sb3_htr.adaptation.actor_alone import acting_state, make_actor_alone
 from sb3_htr.common.atomic import atomic_path
@@ -28,7 +29,7 @@ class AdaptedAgent:
 
     def __init__(self, policy: BasePolicy, z: np.ndarray, returns: np.ndarray, successes: np.ndarray) -> None:
         self.policy = policy
-        self.z = z
+        self.z = np.array(z, dtype=np.float32)
         self.returns = returns
         self.successes = successes
 
@@ -78,4 +79,4 @@ class AdaptedAgent:
             raise
         except Exception:  # whatever a stranger can put into a file
             raise ValueError(f"{path} is damaged, or no agent saved by AdaptedAgent.save: nothing of it was loaded.") from None
-        return cls(policy.to(device), z, returns, successes)
+        return cls(policy.to(get_device(device)), z, returns, successes)

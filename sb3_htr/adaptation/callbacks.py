@@ -8,6 +8,7 @@ from typing import Any, cast
 import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.evaluation import MetaLearner, first_success, record_adaptation, task_set
 from sb3_htr.adaptation.explorers import to_explorer
@@ -31,6 +32,7 @@ class MetaEvalCallback(EvalCallback):
     :param n_eval_episodes: adaptation episodes per task (PEARL's reference: 20)
     :param explorer: an :class:`sb3_htr.adaptation.Explorer`, its name, or its name and settings; the model's own by default
     :param kwargs: arguments of SB3's ``EvalCallback``
+    :raises ValueError: for settings that are none, and at the beginning of a training on this very env
     """
 
     def __init__(
@@ -86,6 +88,10 @@ class MetaEvalCallback(EvalCallback):
         return [child for child in (self.callback, self.callback_on_new_best) if child is not None]
 
     def _init_callback(self) -> None:
+        if _share_an_env(self.eval_env, self.model.get_env()):
+            raise ValueError(
+                "eval_env is the env that is trained on, whose episodes an evaluation would break off: pass another."
+            )
         # SB3's warns where training and evaluation envs are of different types, which they may be here
         for folder in (self.best_model_save_path, self.log_path and os.path.dirname(self.log_path)):
             if folder:
@@ -166,3 +172,10 @@ class MetaEvalCallback(EvalCallback):
                 f"Eval num_timesteps={self.num_timesteps}: return of adaptation episode 1: {returns[:, 0].mean():.2f}, "
                 f"of episode {returns.shape[1]}: {self.last_mean_reward:.2f}, success {successes[:, -1].mean():.0%}"
             )
+
+
+def _share_an_env(one: VecEnv, other: VecEnv | None) -> bool:
+    if other is None:
+        return False
+    ours, theirs = ({id(env.unwrapped) for env in (venv, *getattr(venv.unwrapped, "envs", ()))} for venv in (one, other))
+    return bool(ours & theirs)

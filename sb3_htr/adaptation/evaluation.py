@@ -11,7 +11,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.loop import Adapting, adaptation_steps
-from sb3_htr.common.checks import check_is_env, get_max_episode_steps, get_task_family
+from sb3_htr.common.checks import check_is_env, get_task_family
 from sb3_htr.common.random_state import MAX_SEED, seeded_actions
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.type_aliases import TaskFamily
@@ -173,7 +173,6 @@ def record_adaptation(
         env = BaseAlgorithm._wrap_env(env, monitor_wrapper=False)
     model.check_env(env)
     tasks = task_set(get_task_family(env), "test" if tasks is None else tasks)
-    get_max_episode_steps(env)
     seed = int(seed)  # torch takes no numbers of numpy
     generator = th.Generator().manual_seed(seed)
     env.seed(seed)

@@ -1,12 +1,23 @@
 """The step loop that rollouts, evaluations and whoever watches an agent share."""
 
+import traceback
 from collections.abc import Callable, Iterator
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_htr.adaptation.adaptation import Step
+from sb3_htr.common.checks import get_max_episode_steps
+
+# An adaptation gives up after an episode of so many times those of training: an env that never ends one would hang
+ENDLESS = 10
+# Functions of SB3's DummyVecEnv, and what an env returned that cannot be stored there
+NOT_STORED = {
+    "_save_obs": "an env's observations must have the shape of its observation_space",
+    "step_wait": "an env's reward must be a number",
+}
 
 
 class Adapting(Protocol):
@@ -45,6 +56,7 @@ def adaptation_steps(
     unscale_action: Callable[[np.ndarray], np.ndarray],
     act: Callable[[np.ndarray], np.ndarray],
     obs: np.ndarray,
+    max_episode_steps: int | None = None,
 ) -> Iterator[Step]:
     """
     Act until each env has finished so many episodes; envs whose episodes are shorter go on with more of them.
@@ -55,22 +67,43 @@ def adaptation_steps(
     :param unscale_action: from [-1, 1] to the bounds of the action space
     :param act: observations (n_envs, obs_dim) to actions (n_envs, action_dim) scaled to [-1, 1]
     :param obs: (n_envs, obs_dim) of that reset
+    :param max_episode_steps: that episodes of training had; by default the time limit of the env
     :return: what each env did, step by step
+    :raises ValueError: for an episode that does not end, observations of another shape, rewards that are no numbers
     """
+    longest = ENDLESS * (get_max_episode_steps(env) if max_episode_steps is None else max_episode_steps)
+    length = np.zeros(env.num_envs, dtype=np.int64)
     if isinstance(adaptation, SeesTasks):
         adaptation.see_tasks(np.stack(env.get_attr("task")))
     remaining = np.full(env.num_envs, n_episodes)
     while (remaining > 0).any():
         actions = act(obs)
-        new_obs, rewards, dones, infos = env.step(unscale_action(actions))
+        new_obs, rewards, dones, infos = _step(env, unscale_action(actions))
         assert isinstance(new_obs, np.ndarray)
         next_obs = new_obs
         ended = np.flatnonzero(dones)
         if len(ended):
             next_obs = new_obs.copy()
             next_obs[ended] = [infos[i]["terminal_observation"] for i in ended]
+        length = np.where(dones, 0, length + 1)
+        if length.max() > longest:
+            raise ValueError(
+                f"An episode goes on after {longest} steps, {ENDLESS} times what those of training had: the env must end its "
+                "episodes, as in a gymnasium.wrappers.TimeLimit."
+            )
         step = Step(obs, actions, rewards, next_obs, dones, infos)
         adaptation.observe(step)
         yield step
         obs = new_obs
         remaining -= dones
+
+
+def _step(env: VecEnv, actions: np.ndarray) -> VecEnvStepReturn:
+    try:
+        return env.step(actions)
+    except ValueError as error:
+        # Where SB3 stores what the env returned; within the env, an error is the env's own
+        wrong = NOT_STORED.get(traceback.extract_tb(error.__traceback__)[-1].name)
+        if wrong is None:
+            raise
+        raise ValueError(f"{error}: {wrong}") from error

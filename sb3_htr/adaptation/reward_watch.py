@@ -10,9 +10,10 @@ LARGER = 5.0
 
 class RewardWatch:
     """
-    Warns once of rewards that are too large, and once of those by which nothing can be told for a success.
+    Warns, once each, of rewards that are too large, and of those by which a success cannot be told.
 
-    A goal that is reached for 0 in place of -1 is such a one: the agent would take all that it does for a failure.
+    Where a goal is reached for 0 in place of -1, the agent would take all that it does for a failure, and where each step
+    returns something more, all for a success.
 
     :param n_envs: number of envs
     :param threshold: above which a step is taken for a success, by what it returns beside what the model says of steps without
@@ -24,6 +25,9 @@ class RewardWatch:
         self._worth = worth
         self._sum = np.zeros(n_envs)
         self._n_steps = np.zeros(n_envs, dtype=np.int64)
+        # Of all steps so far; of one env alone, they may be successes
+        self._least = np.inf
+        self._has_ended = np.zeros(n_envs, dtype=bool)
         self._warned: set[str] = set()
 
     def check(self, beside: np.ndarray, dones: np.ndarray) -> None:
@@ -35,7 +39,11 @@ class RewardWatch:
             self._warn("A step", largest, f"up to about {self._worth:.2g}")
         self._sum += beside
         self._n_steps += 1
+        self._least = min(self._least, beside.min())
         if dones.any():
+            self._has_ended |= dones
+            if self._has_ended.all() and self._n_steps.max() > 1 and self._least > max(self._threshold, 0.0):
+                self._warn("Each step", self._least, "about 0, unless the task is solved from the first step on")
             if (lowest := (self._sum[dones] / self._n_steps[dones]).min()) < -self._threshold:
                 self._warn("On average, the steps of an episode", lowest, f"about 0, and a success up to {self._worth:.2g}")
             self._sum[dones] = self._n_steps[dones] = 0

@@ -4,6 +4,7 @@ import hashlib
 import re
 import sys
 import warnings
+from collections.abc import Iterator
 from typing import Any
 
 import gymnasium as gym
@@ -21,6 +22,8 @@ REWARD_WRAPPERS: dict[str, type[gym.Wrapper]] = {
     "gymnasium's RewardWrapper": gym.RewardWrapper,
     "gymnasium's NormalizeReward": gym.wrappers.NormalizeReward,
 }
+# Of gymnasium's TimeLimit, and of an env that counts the steps itself, as a batched one does
+TIME_LIMITS = ("_max_episode_steps", "max_episode_steps")
 TASK_ENV_ADVICE = (
     "hide the goal of a GoalEnv with htr_envs.hide_goal, on the command line --env HiddenGoal/ID; derive any other env from "
     "htr_envs.TaskEnv and test it with htr_envs.check_task_env"
@@ -66,8 +69,21 @@ def check_spaces(env: GymEnv) -> None:
     ):
         if not isinstance(space, spaces.Box) or len(space.shape) != 1:
             raise ValueError(f"The {name} space is {space}, but PEARL needs a Box of one axis: {advice}")
+    check_acts_in_floats(env.action_space)
     if not env.action_space.is_bounded():  # type: ignore[attr-defined]
         raise ValueError(f"The action space {env.action_space} has no bounds: give it some, and scale actions in the env.")
+
+
+def check_acts_in_floats(action_space: spaces.Space[Any]) -> None:
+    """
+    :param action_space: of an env to train on, or to adapt in
+    :raises ValueError: if its actions are whole numbers
+    """
+    if not np.issubdtype(action_space.dtype, np.floating):
+        raise ValueError(
+            f"The action space {action_space} has whole numbers, but actions are floats: give the env a Box of float32, and "
+            "let it round them."
+        )
 
 
 def check_fits(env: VecEnv, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
@@ -89,6 +105,7 @@ def check_fits(env: VecEnv, observation_space: spaces.Space[Any], action_space: 
             else:
                 advice = "Wrap the env to have those of training (RescaleAction does it for actions), or train another model."
             raise ValueError(f"{name} spaces do not match: {here} here, {there} in training. {advice}")
+    check_acts_in_floats(env.action_space)
 
 
 def _bounds_fit(here: Any, there: Any, may_be_unknown: bool) -> bool:
@@ -120,6 +137,12 @@ def get_task_family(env: VecEnv) -> TaskFamily:
             check_same_family(family_facts(family), family_facts(other), f"Env {i} of the VecEnv", "the first one")
     if not hasattr(family, "train_tasks"):
         raise ValueError(f"The env's task_family has no train_tasks to meta-train on: {TASK_ENV_ADVICE}.")
+    tasks = family.train_tasks
+    if not isinstance(tasks, np.ndarray) or tasks.ndim != 2 or len(tasks) == 0:
+        what = f"of shape {tasks.shape}" if isinstance(tasks, np.ndarray) else f"a {type(tasks).__name__}"
+        raise ValueError(
+            f"The task_family's train_tasks are {what}, expected an array (n_tasks, task_dim) of at least one task."
+        )
     return family
 
 
@@ -147,20 +170,34 @@ def check_has_hooks(family: TaskFamily) -> None:
 def get_max_episode_steps(env: VecEnv) -> int:
     """
     :param env: env to train on
-    :return: its time limit
+    :return: its time limit: of several around one env the shortest, and of the envs the longest. Of envs in other processes,
+        the outermost alone can be seen
     :raises ValueError: if it has none
     """
-    # gymnasium's TimeLimit, or an env that counts the steps itself, as a batched one does
-    for name in ("_max_episode_steps", "max_episode_steps"):
-        if env.has_attr(name) and (limit := env.get_attr(name)[0]) is not None:
-            return int(limit)
-    spec = env.get_attr("spec")[0] if env.has_attr("spec") else None
-    if spec is None or spec.max_episode_steps is None:
+    envs = getattr(env.unwrapped, "envs", None)
+    if envs is not None:
+        limits: list[int | None] = [min(_time_limits(single), default=None) for single in envs]
+    else:
+        name = next((name for name in TIME_LIMITS if env.has_attr(name)), None)
+        limits = [None] if name is None else env.get_attr(name)
+    if None in limits:
+        specs = env.get_attr("spec") if env.has_attr("spec") else [None]
+        limits = [None if spec is None else spec.max_episode_steps for spec in specs]
+    known = [int(limit) for limit in limits if limit is not None]
+    if len(known) < len(limits):
         raise ValueError(
             "The env has no time limit, so its episodes may never end: make it with gymnasium.make(id), "
             "registered with max_episode_steps."
         )
-    return int(spec.max_episode_steps)
+    return max(known)
+
+
+def _time_limits(env: gym.Env[Any, Any]) -> Iterator[int]:
+    """Of an env and all wrappers around it."""
+    layer: Any = env
+    while layer is not None:
+        yield from (limit for name in TIME_LIMITS if (limit := getattr(layer, name, None)) is not None)
+        layer = layer.env if isinstance(layer, gym.Wrapper) else None
 
 
 def family_facts(family: TaskFamily) -> dict[str, str]:

@@ -1,6 +1,7 @@
 """What a policy is that acts on an observation and a task variable z."""
 
 from abc import abstractmethod
+from contextvars import ContextVar
 from typing import TypeAlias
 
 import numpy as np
@@ -14,13 +15,15 @@ from sb3_htr.common.normalizer import ObservationNormalizer
 Obs: TypeAlias = np.ndarray | dict[str, np.ndarray]
 State: TypeAlias = tuple[np.ndarray, ...] | None
 
+# From predict() to what SB3 calls within it. Of each thread: agents of one model share its policy, each with a z of its own
+_z: ContextVar[th.Tensor | None] = ContextVar("z", default=None)
+
 
 class LatentPolicy(BasePolicy):
     """A policy of Stable-Baselines3 for which the state of ``predict`` is z."""
 
     latent_dim: int
     normalizer: ObservationNormalizer | None
-    _z: th.Tensor
 
     def predict(
         self, observation: Obs, state: State = None, episode_start: np.ndarray | None = None, deterministic: bool = False
@@ -32,7 +35,7 @@ class LatentPolicy(BasePolicy):
         :param episode_start: ignored: z lives longer than an episode
         :param deterministic: mean action instead of a sample
         :return: actions, and the state for the next call
-        :raises ValueError: for a state that is none
+        :raises ValueError: for a state that is none, and observations that are no finite numbers
         """
         n = len(observation) if np.ndim(observation) > 1 else 1  # type: ignore[arg-type]
         if state is not None and not (
@@ -44,15 +47,21 @@ class LatentPolicy(BasePolicy):
                 else f"{type(state).__name__} of shape {np.shape(state)}"
             )
             raise ValueError(f"state is {what}, expected a tuple of one array, z, of shape ({n}, {self.latent_dim}).")
+        if not isinstance(observation, dict) and not np.isfinite(observation).all():
+            raise ValueError(f"The observation is {observation}, expected finite numbers: no action follows from it.")
         z = np.zeros((1, self.latent_dim), dtype=np.float32) if state is None else state[0]
-        self._z = th.as_tensor(z, dtype=th.float32, device=self.device)
-        actions, _ = super().predict(observation, None, episode_start, deterministic)
+        outer = _z.set(th.as_tensor(z, dtype=th.float32, device=self.device))
+        try:
+            actions, _ = super().predict(observation, None, episode_start, deterministic)
+        finally:
+            _z.reset(outer)
         return actions, (z,)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         assert isinstance(observation, th.Tensor)
         obs = self.normalize(observation.flatten(1).float())
-        return self._act(th.cat([obs, self._z.expand(len(obs), -1)], dim=1), deterministic)
+        z = obs.new_zeros(1, self.latent_dim) if (z := _z.get()) is None else z
+        return self._act(th.cat([obs, z.expand(len(obs), -1)], dim=1), deterministic)
 
     def normalize(self, obs: th.Tensor) -> th.Tensor:
         """

@@ -3,7 +3,6 @@
 import io
 import pathlib
 import pickle
-import traceback
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator
@@ -42,8 +41,6 @@ from sb3_htr.htr.reward_hook import check_reward_hook
 from sb3_htr.pearl.horizon import BY_HORIZON, STEPS_PER_UPDATE, complete, timesteps_for
 from sb3_htr.pearl.policies import PEARLPolicy
 
-# An adaptation gives up after an episode of so many times those of training: an env that never ends one would hang
-ENDLESS = 10
 # Arguments of the replay buffer that are the model's
 GIVEN_BY_MODEL = (
     "buffer_size",
@@ -153,6 +150,8 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         self._warned_not_adapted = False
 
     def _setup_model(self) -> None:
+        if self.env is None and not hasattr(self, "observation_space"):
+            raise ValueError(f"{type(self).__name__} has no env to make its networks for: pass one, or the id of one.")
         # Not in the constructor: settings can be given to load() too, in place of those of the file
         self._complete_settings()
         self.explorer, self.train_explorer = to_explorer(self.explorer), to_explorer(self.train_explorer)
@@ -201,7 +200,12 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
     def _setup_replay(self, env: VecEnv) -> None:
         checks.check_rewards(env)
         family = checks.get_task_family(env)
-        self.max_episode_steps = checks.get_max_episode_steps(env)
+        before, self.max_episode_steps = self.max_episode_steps, checks.get_max_episode_steps(env)
+        if before not in (None, self.max_episode_steps):
+            warnings.warn(
+                f"The env's time limit is {self.max_episode_steps} steps, and what follows from it is still of {before}: to "
+                f"train on this env, make a new model, or give load what it should have ({', '.join(BY_HORIZON)})."
+            )
         # Training tasks in the order of the coming rollouts: every task once, then every task once in another order
         self._task_queue = np.zeros(0, dtype=np.int64)
         buffer_class = cast(type[MultiTaskReplayBuffer], self.replay_buffer_class)
@@ -247,10 +251,11 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         """
         vec_env = self._wrap_env(env)
         checks.check_rewards(vec_env)
+        family, n_steps = checks.get_task_family(vec_env), checks.get_max_episode_steps(vec_env)
         if self.replay_buffer is not None and self.replay_buffer.size() > 0:
             known = checks.family_facts(self.replay_buffer.task_family)
-            checks.check_same_family(known, checks.family_facts(checks.get_task_family(vec_env)), "The env")
-            if (n_steps := checks.get_max_episode_steps(vec_env)) > self.replay_buffer.max_episode_steps:
+            checks.check_same_family(known, checks.family_facts(family), "The env")
+            if n_steps > self.replay_buffer.max_episode_steps:
                 raise ValueError(
                     f"The env's time limit is {n_steps} steps, and what was collected has room for episodes of "
                     f"{self.replay_buffer.max_episode_steps}: load the model on this env, without its experience."
@@ -293,13 +298,17 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         :param reset_num_timesteps: count env steps from 0
         :param progress_bar: show one
         :return: self
-        :raises ValueError: for a model that was loaded without an env
+        :raises ValueError: for a model that was loaded without an env, and numbers out of their ranges
         """
         checks.check_has_env(self.env)
         if total_timesteps is None:
             assert self.replay_buffer is not None
             total_timesteps = timesteps_for(self.replay_buffer.max_episode_steps)
-        return super().learn(
+        check_numbers(total_timesteps=(total_timesteps, 0.0))
+        if log_interval is not None:
+            check_numbers(log_interval=(log_interval, 1))
+        n_updates = self._n_updates
+        super().learn(
             total_timesteps=total_timesteps,
             callback=callback,
             log_interval=log_interval,  # type: ignore[arg-type]
@@ -307,6 +316,13 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
             reset_num_timesteps=reset_num_timesteps,
             progress_bar=progress_bar,
         )
+        if self._n_updates == n_updates and total_timesteps > 0 and self.num_timesteps >= self._total_timesteps:
+            warnings.warn(
+                f"Nothing was learnt: learning begins after {self.learning_starts} env steps, at the end of a rollout, and "
+                f"this training had {self.num_timesteps}. Allow more, or lower learning_starts.",
+                stacklevel=2,
+            )
+        return self
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         return super()._init_callback(followed_by(callback, MetaProgressBarCallback()) if progress_bar else callback)
@@ -317,7 +333,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
             warnings.warn(
                 "The experience that this model was trained on is not there, so it goes on with new episodes alone: "
                 "load_replay_buffer brings back what save_replay_buffer has saved.",
-                stacklevel=3,
+                stacklevel=5,
             )
         # The weights of a file may be of a family without successes
         self.knowledge.set_tells_success(self.replay_buffer.tells_rewards)
@@ -418,10 +434,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         try:
             return next(steps, None)
         except ValueError as error:
-            # Where SB3 stores what the env returned; within the env, an error is the env's own
-            stored = traceback.extract_tb(error.__traceback__)[-1].name == "_save_obs"
-            shape = ": an env's observations must have the shape of its observation_space" if stored else ""
-            raise ValueError(f"{where}: {error}{shape}") from error
+            raise ValueError(f"{where}: {error}") from error
         except (EOFError, ConnectionError) as error:
             raise RuntimeError(
                 f"{where}, the process of an env died: its own traceback is printed above. Envs in one process (vec_env "
@@ -514,23 +527,16 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         adaptation = self.start_adaptation(1, explorer, th.Generator().manual_seed(seed))
         returns, successes = np.zeros(n_episodes), np.zeros(n_episodes, dtype=bool)
         act = partial(adaptation.act, deterministic=deterministic)
-        assert self.max_episode_steps is not None  # as there is a policy, there was an env
-        longest = ENDLESS * self.max_episode_steps
-        length = 0
         obs = np.asarray(vec_env.reset())
         if task is not None and np.ndim(task) > 0:
             checks.check_tasks(vec_env, np.asarray(task, dtype=np.float32)[None])
         elif task is not None:
             checks.check_task_ids(vec_env, np.atleast_1d(task))
         with seeded_actions(seed, deterministic):
-            for step in adaptation_steps(vec_env, adaptation, n_episodes, self.policy.unscale_action, act, obs):
+            for step in adaptation_steps(
+                vec_env, adaptation, n_episodes, self.policy.unscale_action, act, obs, self.max_episode_steps
+            ):
                 episode = adaptation.n_episodes[0] - step.dones[0]
-                length = 0 if step.dones[0] else length + 1
-                if length > longest:
-                    raise ValueError(
-                        f"An episode goes on after {longest} steps, {ENDLESS} times what those of training had: the env must "
-                        "end its episodes, as in a gymnasium.wrappers.TimeLimit."
-                    )
                 returns[episode] += step.rewards[0]
                 # Some envs give a number
                 successes[episode] |= bool(step.infos[0].get("is_success", adaptation.task_reward[0] > 0))

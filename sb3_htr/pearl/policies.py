@@ -136,8 +136,6 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
                 lr=lr_schedule(1),  # type: ignore[call-arg]
                 **self.optimizer_kwargs,
             )
-        # z of predict() calls without a state: the prior mean
-        self._z = th.zeros(1, self.latent_dim)
         self.critic_target.requires_grad_(False)
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:

@@ -1,5 +1,7 @@
 """Agents that are adapted to one task: saved, and loaded without the model."""
 
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from torch import nn
 from helpers import ENV_ID, MakePEARL, with_policy
 from helpers.bombs import bombs
 from sb3_htr import AdaptedAgent
+from sb3_htr.adaptation import Step
 
 pytestmark = pytest.mark.filterwarnings("ignore:No reward was found")
 
@@ -129,3 +132,30 @@ def test_sampled_actions_of_an_adaptation_are_those_of_its_seed(tiny_pearl: Make
     np.testing.assert_array_equal(actions[0], actions[1])
     assert (np.array(actions[0]) != np.array(actions[2])).any()
     assert th.equal(state, th.get_rng_state())
+
+
+def test_agents_of_one_model_act_side_by_side(tiny_pearl: MakePEARL) -> None:
+    """Each thread's robot has a task of its own, and all share the networks."""
+    policy = tiny_pearl().policy
+    agents = [AdaptedAgent(policy, z, np.zeros(0), np.zeros(0, dtype=bool)) for z in np.eye(3, dtype=np.float32) * 5]
+    obs = np.ones(2, dtype=np.float32)
+    alone = [agent.predict(obs, deterministic=True)[0] for agent in agents]
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(3) as threads:
+            actions = threads.map(lambda agent: [agent.predict(obs, deterministic=True)[0] for _ in range(200)], agents)
+            for expected, found in zip(alone, actions, strict=True):
+                np.testing.assert_array_equal(found, np.broadcast_to(expected, (200, 2)))
+    finally:
+        sys.setswitchinterval(interval)
+
+
+def test_an_agent_stays_as_it_is_when_the_adaptation_goes_on(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    adaptation = model.start_adaptation(2, explorer="prior")
+    agent = AdaptedAgent(model.policy, adaptation.explorer.final_z()[0], np.zeros(0), np.zeros(0, dtype=bool))
+    before, obs = agent.z.copy(), np.zeros((2, 2), dtype=np.float32)
+    adaptation.observe(Step(obs, obs, [0.0, 0.0], obs, [True, True]))  # type: ignore[arg-type]
+    assert (adaptation.z[0] != before).any()
+    np.testing.assert_array_equal(agent.z, before)

@@ -1,9 +1,11 @@
 """The step loop that rollouts, evaluations and players share."""
 
 from functools import partial
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pytest
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from helpers import ENV_ID
@@ -45,3 +47,14 @@ def test_each_env_finishes_its_episodes_and_each_step_is_whole() -> None:
             moved = step.observations[i] + 0.1 * step.actions[i]
             np.testing.assert_allclose(step.next_observations[i], moved, atol=1e-6, err_msg="the last one of its episode")
             expected = np.zeros(2) if step.dones[i] else step.next_observations[i]
+
+
+def test_an_episode_that_nobody_ends_is_given_up() -> None:
+    class Endless(gym.Wrapper[Any, Any, Any, Any]):
+        max_episode_steps = 3
+
+    env = DummyVecEnv([lambda: Endless(gym.make(ENV_ID, max_episode_steps=1000))])
+    first = env.reset()
+    assert isinstance(first, np.ndarray)
+    with pytest.raises(ValueError, match="An episode goes on after 30 steps, 10 times what those of training had"):
+        list(adaptation_steps(env, Noting(), 1, lambda actions: actions, Noting().act, first))

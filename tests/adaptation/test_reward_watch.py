@@ -23,9 +23,13 @@ from sb3_htr.adaptation import Step
             lambda reward: reward / 10,
             r"another scale than in meta-training: .* rewarded step returned 0\.[01]\d* more .*, and at least 0\.[45]\d*",
         ),
+        (
+            lambda reward: reward + 1,
+            r"Each step returned (1|0\.9\d*) more than .*, expected about 0, unless the task is solved",
+        ),
         (lambda reward: reward, ""),
     ],
-    ids=["of another scale", "by another convention", "too small", "as in training"],
+    ids=["of another scale", "by another convention", "too small", "with something for each step", "as in training"],
 )
 def test_rewards_unlike_those_of_training_are_warned_of(given: Callable[[float], float], message: str) -> None:
     """An agent for which a goal is 1 would never find one that is 0 in place of -1."""

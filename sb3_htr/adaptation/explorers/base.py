@@ -79,4 +79,4 @@ class Explorer(ABC):
         """
         :return: (n_envs, latent_dim), the z to act with when no more episodes follow
         """
-        return self.z
+        return self.z.copy()
