@@ -37,13 +37,7 @@ def check_reward_hook(
     if successes.dtype != np.bool_:
         raise ValueError(f"is_success must return bool, one for each step, and returned {successes.dtype}.")
     solved = successes[:, 0]
-    wrong = ~np.isclose(given, computed, rtol=1e-4, atol=1e-4)
-    if wrong.any():
-        i = int(wrong.argmax())
-        raise ValueError(
-            f"The env gave {given[i]:g} for a step of task {task[i]}, but its compute_reward gives {computed[i]:g}: "
-            "relabelled rewards would be of another task family. Run htr_envs.check_task_env(env) to find out why."
-        )
+    check_rewards_told(given, computed, task)
     _check_whole_episodes(family, columns, episodes[:MAX_WHOLE], computed, solved)
     _check_worth(family, columns, np.stack([episode[-1] for _, episode in episodes]))
     worthless = ~solved & (np.abs(given - traj.task_free_reward[:, 0]) > 1e-4 + 10 * ROUNDING * np.abs(given))
@@ -60,6 +54,22 @@ def check_reward_hook(
             "Episodes end where their task is solved, and only there. Relabelled ones do not: nothing is learnt of staying at "
             "a goal, and ends tell what the task is. Let the env go on up to its time limit.",
             stacklevel=2,
+        )
+
+
+def check_rewards_told(given: np.ndarray, computed: np.ndarray, tasks: np.ndarray) -> None:
+    """
+    :param given: (n,), rewards that the env gave
+    :param computed: (n,), what the reward hook tells of these steps
+    :param tasks: (n, ...), their tasks, or indices of these, for the message
+    :raises ValueError: if they differ
+    """
+    wrong = ~np.isclose(given, computed, rtol=1e-4, atol=1e-4)
+    if wrong.any():
+        i = int(wrong.argmax())
+        raise ValueError(
+            f"The env gave {given[i]:g} for a step of task {tasks[i]}, but its compute_reward gives {computed[i]:g}: "
+            "relabelled rewards would be of another task family. Run htr_envs.check_task_env(env) to find out why."
         )
 
 

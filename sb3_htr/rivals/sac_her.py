@@ -16,10 +16,18 @@ from stable_baselines3.sac import SAC
 from stable_baselines3.sac.policies import MultiInputPolicy, SACPolicy
 
 from sb3_htr.adaptation.loop import Adapting
-from sb3_htr.common.checks import check_is_env, check_same_family, family_facts, get_max_episode_steps, get_task_family
+from sb3_htr.common.checks import (
+    check_is_env,
+    check_rewards,
+    check_same_family,
+    family_facts,
+    get_max_episode_steps,
+    get_task_family,
+)
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.type_aliases import Trajectory
 from sb3_htr.common.vec_env import N_ENVS, in_float32, make_task_vec_env
+from sb3_htr.htr.reward_hook import check_rewards_told
 from sb3_htr.rivals.base import Rival, ToldAdaptation, unscaled
 from sb3_htr.rivals.shown_task import ShownTaskVecEnv
 
@@ -28,6 +36,27 @@ class TaskHerReplayBuffer(HerReplayBuffer):
     """
     SB3's HER, with the reward hook of the task family, which rewards a whole step and not its achieved goal alone.
     """
+
+    def add(  # type: ignore[override]
+        self,
+        obs: dict[str, np.ndarray],
+        next_obs: dict[str, np.ndarray],
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """
+        Store one step of each env; arguments are SB3's.
+
+        :raises ValueError: if the reward hook disagrees with what the env gave
+        """
+        assert isinstance(self.env, ShownTaskVecEnv) and isinstance(self.action_space, spaces.Box)
+        task_free = np.array([info.get("task_free_reward", 0.0) for info in infos], dtype=np.float32)
+        columns = obs["observation"], unscaled(action, self.action_space), next_obs["observation"], task_free
+        step = Trajectory(*(values[:, None] for values in columns))
+        check_rewards_told(reward, self.env.shown.family.compute_reward(step, obs["desired_goal"])[:, 0], obs["desired_goal"])
+        super().add(obs, next_obs, action, reward, done, infos)
 
     def _get_virtual_samples(
         self, batch_indices: np.ndarray, env_indices: np.ndarray, env: VecNormalize | None = None
@@ -98,7 +127,7 @@ class SACHER(Rival, SAC):
     :param replay_buffer_kwargs: arguments of SB3's ``HerReplayBuffer``
     :param seed: seed of all random generators
     :param kwargs: arguments of ``SAC`` but ``train_freq`` and ``replay_buffer_class``
-    :raises ValueError: for an env without tasks or time limit
+    :raises ValueError: for an env without tasks or time limit, or with rewards that are not those of its tasks
     """
 
     DEFAULT_POLICY: ClassVar[str] = "MultiInputPolicy"
@@ -149,6 +178,7 @@ class SACHER(Rival, SAC):
 
     def _setup_replay(self, env: VecEnv) -> None:
         assert isinstance(env, ShownTaskVecEnv)
+        check_rewards(env)
         self.shown = env.shown
         self.train_freq = TrainFreq(get_max_episode_steps(env), TrainFrequencyUnit.STEP)  # type: ignore[assignment]
         if self._has_experience():

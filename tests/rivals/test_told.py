@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -164,3 +165,18 @@ def test_floor_and_ceiling_of_the_point_robot() -> None:
 def test_a_family_without_hindsight_tasks_is_refused() -> None:
     with pytest.raises(ValueError, match="task_family has no compute_reward, which hindsight relabelling"):
         tiny_sac_her(DummyVecEnv([make_cart]))
+
+
+def test_rewards_that_are_not_those_of_the_tasks_are_refused() -> None:
+    with pytest.raises(ValueError, match="The env's reward_type is not 'sparse'"):
+        tiny_sac_her(make_task_vec_env(ENV_ID, 2, env_kwargs={"reward_type": "dense"}))
+    with pytest.raises(ValueError, match="gymnasium's RewardWrapper, which changes its rewards"):
+        tiny_sac_her(gym.wrappers.TransformReward(gym.make(ENV_ID), lambda reward: 100 * float(reward)))
+
+    class Pays(gym.Wrapper[Any, Any, Any, Any]):
+        def step(self, action: Any) -> Any:
+            obs, reward, *ends = self.env.step(action)
+            return obs, float(reward) + 0.5, *ends
+
+    with pytest.raises(ValueError, match=r"The env gave 0\.5 for a step of task .*, but its compute_reward gives 0"):
+        tiny_sac_her(Pays(gym.make(ENV_ID))).learn(20)

@@ -129,6 +129,10 @@ def test_an_export_folder_is_this_model_and_nothing_else(hub: Hub, tmp_path: Pat
         main(arguments)
     with pytest.raises(ValueError, match=r"holds other files"):
         main([*arguments[:-1], "."])
+    Path("shared", "thesis.tex").unlink()
+    with pytest.raises(ValueError, match="n_episodes is 0"):
+        main([*arguments, "--n-episodes", "0"])
+    assert names("shared") == [".gitattributes", "README.md", MODEL], "nothing is lost by a slip"
 
 
 @pytest.mark.parametrize(("env_id", "normalized"), [(ENV_ID, False), ("SparseWheeled-v0", True)])

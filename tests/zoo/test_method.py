@@ -18,7 +18,7 @@ from sb3_htr.adaptation import Belief, Prior
 from sb3_htr.adaptation.explorers import to_explorer
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run.agents import RECORD, agent_for
-from sb3_htr.zoo.run.method import PEARLMethod, get_method, merged, methods
+from sb3_htr.zoo.run.method import PEARLMethod, get_method, merged, methods, register_method
 from sb3_htr.zoo.run.shipped import hyperparams_file
 
 OWN = ["htr-ser", "htr-ec", "pearl-dense", "pearl-sparse", "htr-hfr", "htr-hipi"]
@@ -236,3 +236,52 @@ def test_a_method_may_stand_in_the_yaml_file_and_among_the_params(tmp_path: Path
         assert main([*arguments, "--verbose", "0", *more]) == 0
         record = json.loads((run_folder(tmp_path, expected) / RECORD).read_text())
         assert record["method"] == expected and "method" not in record["hyperparams"]
+
+
+def test_what_a_method_replaces_of_a_file_is_said(tmp_path: Path) -> None:
+    block: dict[str, Any] = {key: value for key, value in TINY.items() if key != "seed"}
+    block |= {"policy": "MlpPolicy", "n_timesteps": 240, "n_envs": 4, "explorer": "prior", "train_explorer": "aggregate"}
+    block["replay_buffer_kwargs"] = {"relabeller": {"name": "EpisodeClustering"}, "relabel_probability": 0.3}
+    (tmp_path / "my.yml").write_text(yaml.safe_dump({ENV_ID: block}))
+    arguments = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(tmp_path / "my.yml"), "--eval-freq", "-1"]
+    replaced = "explorer 'prior', relabeller 'EpisodeClustering', relabel_probability 0.3, which the method htr-ser replaces"
+    with pytest.warns(UserWarning, match=replaced):
+        assert main([*arguments, "--verbose", "0"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("learning_rate", "n_timesteps", "more", "message"),
+    [
+        ("1e-3", 240, "", r"learning_rate is the text '1e-3' \(.*my\.yml\), expected a number: in YAML, 1\.0e-3 is one"),
+        (0.001, "1e3", "", "n_timesteps is the text '1e3'"),
+        (0.001, 240, "replay_buffer_kwargs: 3", "replay_buffer_kwargs is 3 .*, expected names and values"),
+        (0.001, 240, "env_kwargs: 3", "env_kwargs is 3 .*, expected names and values"),
+        (0.001, 240, "gamma: [", r"my\.yml cannot be read: while parsing a flow node"),
+    ],
+)
+def test_what_yaml_makes_of_a_slip(learning_rate: Any, n_timesteps: Any, more: str, message: str, tmp_path: Path) -> None:
+    lines = ["policy: MlpPolicy", "n_envs: 4", f"learning_rate: {learning_rate}", f"n_timesteps: {n_timesteps}", more]
+    (tmp_path / "my.yml").write_text("\n".join([f"{ENV_ID}:", *(f"  {line}" for line in lines)]))
+    with pytest.raises(ValueError, match=message) as refusal:
+        main(["train", "--env", ENV_ID, "-f", str(tmp_path / "logs"), "-conf", str(tmp_path / "my.yml")])
+    assert "\n" not in str(refusal.value) and not (tmp_path / "logs").exists()
+
+
+def test_no_method_replaces_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = dict(methods())
+    monkeypatch.setattr("sb3_htr.zoo.run.method.methods", lambda: known)
+    settings: dict[str, Any] = {"about": "mine", "relabeller": "SingleEpisodeRelabelling", "relabel_probability": 0.3}
+    settings |= {"rl_reward_type": "sparse", "train_explorer": "aggregate", "explorer": "belief"}
+    register_method("mine-prior", **settings)
+    with pytest.raises(ValueError, match="There is a method 'mine-prior' already"):
+        register_method("mine", **settings)
+    for wrong, message in (
+        ({"relabel_probability": "lots"}, "relabel_probability is 'lots', expected a number from 0 to 1"),
+        ({"rl_reward_type": "dens"}, r"rl_reward_type of the method 'other' is 'dens', expected one of \['dense', 'sparse'\]"),
+        ({"explorer": {"name": "prior"}}, "explorer of the method 'other' is {'name': 'prior'}, expected one of"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            register_method("other", **{**settings, **wrong})
+    with pytest.raises(ValueError, match="expected one that can be the name of a folder"):
+        register_method("a/b", **settings)
+    assert "other" not in known and "mine" not in known and "mine-prior-prior" in known

@@ -23,17 +23,21 @@ from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.commands import optimize, train
 from sb3_htr.zoo.commands.optimize import without_password
+from sb3_htr.zoo.run.manager import MetaExperimentManager
 from sb3_htr.zoo.run.method import PEARLMethod, get_method, merged, methods
 from sb3_htr.zoo.run.search_space import ENCODER_ARCHS, convert_pearl_params, sample_pearl_params
+from sb3_htr.zoo.run.storage import absolute
 
 SMALL = ["-params", "n_tasks_per_rollout:4", "n_episodes_per_task:3", "learning_starts:240", "n_envs:4"]
 
 
-def search(folder: Path, storage: str, n_trials: int = 2, method: str | None = None) -> int:
+def search(folder: Path, storage: str, *more: str, n_trials: int = 2, method: str | None = None) -> int:
     arguments = ["optimize", "--env", ENV_ID, "-f", str(folder), "-n", "480", "--n-trials", str(n_trials), "--seed", "1"]
     # Near goals: trials of any seed have something to report
     arguments += ["--env-kwargs", "goal_distance:0.1", *(["--method", method] if method else [])]
-    return main([*arguments, "--n-evaluations", "2", "--storage", storage, "--study-name", "test", "--verbose", "0", *SMALL])
+    return main(
+        [*arguments, "--n-evaluations", "2", "--storage", storage, "--study-name", "test", "--verbose", "0", *more, *SMALL]
+    )
 
 
 def check_search(folder: Path, storage: str, capsys: pytest.CaptureFixture[str], method: str | None = None) -> optuna.Study:
@@ -78,8 +82,11 @@ def test_a_study_in_sqlite(quick: None, tmp_path: Path, capsys: pytest.CaptureFi
 def test_a_study_is_of_one_env_and_one_method(quick: None, tmp_path: Path) -> None:
     storage = f"sqlite:///{tmp_path}/study.db"
     assert search(tmp_path, storage, n_trials=1) == 0
-    with pytest.raises(ValueError, match="The study 'test' is of method htr-ser, and not htr-ec: give --method htr-ser"):
+    with pytest.raises(ValueError, match="The study 'test' is of method htr-ser, and not htr-ec: give --method as there"):
         search(tmp_path, storage, method="htr-ec")
+    for more, known in ((["-n", "960"], "n-timesteps 480"), (["--env-kwargs", "goal_distance:9.0"], "env-kwargs {'goal_")):
+        with pytest.raises(ValueError, match=f"The study 'test' is of {known}"):
+            search(tmp_path, storage, *more)
     trained = ["train", "--env", ENV_ID, "--method", "pearl-sparse", "-f", str(tmp_path), "--storage", storage]
     with pytest.raises(ValueError, match="The study 'test' is of method htr-ser, and not pearl-sparse"):
         main([*trained, "--study-name", "test", "--trial-id", "0"])
@@ -257,8 +264,7 @@ def test_hyperparameters_that_diverge_are_pruned(quick: None, tmp_path: Path, mo
         raise DivergedError("critic_loss is nan")
 
     monkeypatch.setattr(PEARL, "learn", diverge)
-    with pytest.raises(ValueError, match="No trials are completed"):
-        search(tmp_path, f"{tmp_path}/study.log", n_trials=1)
+    assert search(tmp_path, f"{tmp_path}/study.log", n_trials=1) == 0
     study = optimize.create_study(f"{tmp_path}/study.log", "test")
     assert [trial.state for trial in study.get_trials()] == [optuna.trial.TrialState.PRUNED]
 
@@ -272,3 +278,34 @@ def test_the_objective_is_the_return_after_adaptation(quick: None, tmp_path: Pat
     evaluations = np.load(log / "trial_0" / "evaluations.npz")
     value = optimize.create_study(f"{tmp_path}/s.log", "test").best_value
     assert value == pytest.approx(evaluations["returns"][-1, :, -1].mean()) and value > 0
+
+
+def test_a_search_without_a_finished_trial_says_so(
+    quick: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*args: Any) -> float:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(MetaExperimentManager, "objective", stop)
+    assert search(tmp_path, f"sqlite:///{tmp_path}/study.db") == 0
+    assert "no trial was finished. The same command goes on" in capsys.readouterr().out
+
+
+def test_where_the_report_cannot_go_is_said_before_the_search(quick: None, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match="file"):
+        search(tmp_path / "file", f"sqlite:///{tmp_path}/study.db")
+    assert not optuna.load_study(study_name="test", storage=f"sqlite:///{tmp_path}/study.db").trials
+
+
+def test_a_study_is_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path)
+    for storage in ("sqlite:///study.db", "journals/study.log"):
+        whole = absolute(storage)
+        assert whole.endswith(f"{tmp_path}/{storage.removeprefix('sqlite:///')}") and absolute(whole) == whole
+    for storage in ("sqlite:///:memory:", "postgresql+psycopg://user@host/database"):
+        assert absolute(storage) == storage
+    with pytest.raises(ValueError, match=r"there is no file .*study\.db: give that of `sb3-htr optimize`"):
+        main(["train", "--env", ENV_ID, "--storage=sqlite:///study.db", "--study-name", "test", "--trial-id", "0"])
+    assert not Path("study.db").exists()

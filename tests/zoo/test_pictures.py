@@ -152,3 +152,27 @@ def test_plot_draws_seeds_as_one_curve(
         make_run(folders[0], tiny_pearl(), 3, hyperparams={"explorer": {"name": "belief"}, "gamma": 0.5})
         main(["plot", *arguments])
     check_same_settings("none", [])
+
+
+def test_plot_says_what_is_missing_in_a_curve(
+    tmp_path: Path, tiny_pearl: MakePEARL, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = tiny_pearl()
+    runs = [make_run(tmp_path / "runs", model, number) for number in (1, 2, 3)]
+    (runs[1] / "evaluations.npz").unlink()
+    with np.load(runs[2] / "evaluations.npz") as file:
+        first = {name: values[:1] for name, values in file.items()}
+    np.savez(runs[2] / "evaluations.npz", **first)
+    far = make_run(tmp_path / "far", model, env_kwargs={"goal_distance": 2.0})
+    command = ["plot", str(tmp_path / "runs"), str(far), "-l", "near", "far", "--only", "learning", "-o", str(tmp_path / "o")]
+    assert main(command) == 0
+    said = capsys.readouterr().err
+    assert f"{runs[1]} has no evaluations.npz, and is not in the learning curve" in said
+    assert f"{runs[2]} was evaluated up to 480 of 960 env steps, where the curve of near ends" in said
+    assert "different arguments, {'near': {}, 'far': {'goal_distance': 2.0}}: their tasks are not the same" in said
+    (tmp_path / "file").touch()
+    with pytest.raises(FileExistsError):
+        main(["plot", *NOWHERE, "-o", str(tmp_path / "file")])
+    for command_ in ("plot", "evaluate", "enjoy"):
+        with pytest.raises(ValueError, match="seed is -1, expected a whole number from 0 to"):
+            main([command_, *NOWHERE, "--seed", "-1"])

@@ -11,6 +11,8 @@ from htr_envs.goal_env import find_hidden
 from sb3_htr.adaptation.evaluation import TASK_SETS
 from sb3_htr.adaptation.explorers import EXPLORERS
 from sb3_htr.common.checks import check_device
+from sb3_htr.common.random_state import MAX_SEED
+from sb3_htr.common.settings import check_numbers
 from sb3_htr.zoo.run.agents import TrainedAgent, agent_at, agent_for
 from sb3_htr.zoo.run.trust import check_env_kwargs, import_packages, refuse
 
@@ -99,6 +101,9 @@ def chosen_agent(parser: argparse.ArgumentParser, args: argparse.Namespace, path
     :raises ValueError: if arguments contradict each other, or the device cannot be used
     """
     check_device(args.device)
+    for name, limits in {"n_episodes": (1,), "seed": (0, MAX_SEED)}.items():
+        if hasattr(args, name):
+            check_numbers(**{name: (getattr(args, name), *limits)})
     import_packages(args.gym_packages)
     if path is not None:
         if args.exp_id or args.method:

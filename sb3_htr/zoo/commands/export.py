@@ -103,10 +103,6 @@ def main(argv: Sequence[str]) -> None:
     left = [] if alone else earlier_export(output, files(name))
     file = output if alone else output / f"{name}.zip"
     record = export(agent, file)
-    # Not before the model is written: it may be the one that is exported
-    for path in left:
-        if path != file:
-            path.unlink()
     print(f"{file}: {file.stat().st_size / 1e6:.2f} MB, of {agent.path}")
     if alone:
         return
@@ -120,6 +116,10 @@ def main(argv: Sequence[str]) -> None:
         repo_id += f"/{name}"
     with atomic_path(output / CARD) as temporary:
         temporary.write_text(model_card(record, scores, repo_id))
+    # Not before there is a new card: what an earlier export has left tells of another model
+    for path in left:
+        if path not in (file, output / CARD):
+            path.unlink()
     print(f"{output / CARD}: model card, with scores on the test tasks")
     if args.film:
         from sb3_htr.zoo.commands import record as recording

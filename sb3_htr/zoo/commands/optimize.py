@@ -103,6 +103,8 @@ def main(argv: Sequence[str]) -> None:
     if n_running := len(study.get_trials(states=[optuna.trial.TrialState.RUNNING])):
         print(f"{n_running} trials are running, or their workers were killed: --max-total-trials counts them all the same.")
     values = [trial.value for trial in study.get_trials(states=[optuna.trial.TrialState.COMPLETE])]
+    if not values:  # which was said above
+        return
     if not any(values):
         print(f"No trial learnt anything: the return after adaptation is 0 in all {len(values)}. Make the trials longer (-n).")
     else:

@@ -1,6 +1,7 @@
 """``sb3-htr plot``: pictures of one or several runs."""
 
 import argparse
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from functools import reduce
 from pathlib import Path
@@ -24,6 +25,7 @@ from sb3_htr.zoo.run.time_to_learned import time_to_learned
 EXAMPLE = """  sb3-htr plot --env SparsePointRobot-v0                  an agent that comes with the package
   sb3-htr plot runs/htr runs/sparse -l HTR "no relabelling"    the runs in a folder are the seeds of its curve
   sb3-htr plot runs --only learning -o pictures"""
+EVALUATIONS = "evaluations.npz"
 PICTURES = ("learning", "adaptation", "paths", "latent")
 FORMATS = ("png", "svg", "pdf")
 
@@ -100,7 +102,8 @@ def groups_of(parser: argparse.ArgumentParser, args: argparse.Namespace) -> dict
     :return: label and runs of each curve
     :raises ValueError: for runs that do not belong on one curve, or in one picture
     """
-    labels = args.labels or [path.stem if path.suffix == ".zip" else path.name for path in args.agent] or [args.env]
+    paths = [path.resolve() for path in args.agent]
+    labels = args.labels or [path.stem if path.suffix == ".zip" else path.name for path in paths] or [args.env]
     if len(labels) != max(len(args.agent), 1) or len(set(labels)) < len(labels):
         raise ValueError(f"--labels needs one name of its own for each of the {len(args.agent)} folders, got {labels}.")
     groups: dict[str, list[TrainedAgent]] = {}
@@ -112,6 +115,9 @@ def groups_of(parser: argparse.ArgumentParser, args: argparse.Namespace) -> dict
     envs = {agent.env_id for agents in groups.values() for agent in agents}
     if len(envs) > 1:
         raise ValueError(f"These runs are of several envs, {', '.join(sorted(envs))}: plot one env at a time.")
+    of_each = {label: agents[0].record["env_kwargs"] for label, agents in groups.items()}
+    if any(kwargs != next(iter(of_each.values())) for kwargs in of_each.values()):
+        print(f"The envs of these curves have different arguments, {of_each}: their tasks are not the same.", file=sys.stderr)
     return groups
 
 
@@ -146,10 +152,21 @@ def learning_curve(label: str, agents: Sequence[TrainedAgent]) -> Curve | None:
         there are no evaluations, as for the agents that come with the package
     :raises ValueError: if they have no evaluation in common
     """
-    files = [agent.folder / "evaluations.npz" for agent in agents if agent.folder is not None]
-    runs = [load_arrays(file, ("timesteps", "returns", "successes")) for file in files if file.exists()]
+    folders = [agent.folder for agent in agents if agent.folder is not None]
+    evaluated = [folder for folder in folders if (folder / EVALUATIONS).exists()]
+    runs = [load_arrays(folder / EVALUATIONS, ("timesteps", "returns", "successes")) for folder in evaluated]
     if not runs:
         return None
+    for folder in (folder for folder in folders if folder not in evaluated):
+        print(f"{folder} has no {EVALUATIONS}, and is not in the learning curve.", file=sys.stderr)
+    ends = [int(run["timesteps"].max()) for run in runs]
+    for folder, end in zip(evaluated, ends, strict=True):
+        if end < max(ends):
+            print(
+                f"{folder} was evaluated up to {end:,} of {max(ends):,} env steps, where the curve of {label} ends: move it "
+                "away to see the others to their end.",
+                file=sys.stderr,
+            )
     if len({run["returns"].shape[2] for run in runs}) > 1:
         raise ValueError(
             f"The runs in {label} were evaluated after different numbers of adaptation episodes: train them with one "
@@ -169,7 +186,11 @@ def print_time_to_learned(groups: dict[str, list[TrainedAgent]]) -> None:
     :param groups: label and runs of each curve: one line for each of them, with the median over runs
     """
     for label, agents in groups.items():
-        times = [time for agent in agents if agent.folder is not None and (time := time_to_learned(agent.folder)) is not None]
+        folders = [agent.folder for agent in agents if agent.folder is not None and (agent.folder / EVALUATIONS).exists()]
+        ends = [load_arrays(folder / EVALUATIONS, ("timesteps",))["timesteps"].max() for folder in folders]
+        # Of a run that stopped earlier than the others, the last return is no end
+        whole = [folder for folder, end in zip(folders, ends, strict=True) if end == max(ends)]
+        times = [time for folder in whole if (time := time_to_learned(folder)) is not None]
         if times:
             learnt = [time for time in times if np.isfinite(time[0])]
             runs = f" ({len(learnt)} of {len(times)} runs learnt; their median)" if len(times) > 1 else ""
@@ -193,6 +214,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--only", nargs="+", choices=PICTURES, default=PICTURES, help="pictures to draw (default: all)")
     args = parser.parse_args(argv)
     groups = groups_of(parser, args)
+    args.output.mkdir(parents=True, exist_ok=True)  # before any work
     env_id = next(iter(groups.values()))[0].env_id
     written: list[Path] = []
 

@@ -46,8 +46,8 @@ def main(argv: Sequence[str]) -> None:
     output = args.output or Path(f"{agent.stem}.mp4")
     if output.suffix not in SUFFIXES:
         raise ValueError(f"{output} has the suffix {output.suffix!r}, expected one of {', '.join(SUFFIXES)}.")
-    if args.every < 1 or not args.speed > 0:
-        raise ValueError(f"--every is {args.every} and --speed {args.speed}, expected at least 1 and more than 0.")
+    if args.every < 1 or not 0 < args.speed < math.inf:
+        raise ValueError(f"--every is {args.every} and --speed {args.speed}, expected at least 1 and a number above 0.")
     if not can_be_drawn(agent):
         raise ValueError(f"{agent.env_id} cannot be filmed: 'rgb_array' is not in its metadata['render_modes'].")
     fps = agent.make_env().metadata.get("render_fps", 30) * args.speed / args.every

@@ -2,6 +2,7 @@
 
 import argparse
 import difflib
+import shlex
 import traceback
 from collections.abc import Sequence
 from itertools import pairwise
@@ -16,8 +17,11 @@ from sb3_htr.zoo.run.defaults import default_arguments, given_arguments
 from sb3_htr.zoo.run.malloc import keep_freed_memory
 from sb3_htr.zoo.run.manager import run_rl_zoo
 from sb3_htr.zoo.run.method import DEFAULT, get_method, methods
+from sb3_htr.zoo.run.storage import absolute
 from sb3_htr.zoo.run.trust import CONF, check_arguments, import_packages, see_working_folder
 
+# Options with a path behind "="
+PATHS_EQUAL = ("--conf-file=", "--tensorboard-log=", "--storage=")
 OWN_ENV = "An env of your own is found once its module is imported, by --gym-packages MODULE."
 HELP = """sb3-htr train: rl_zoo3's train (its arguments follow) with evaluations that adapt to validation tasks.
 
@@ -84,7 +88,7 @@ def main(argv: Sequence[str]) -> None:
         # An interrupted training leaves a model, too, and so does one that goes on
         if (done := n_steps_done(run)) >= planned and n_steps_of(run / f"{file_stem(record['env_id'])}.zip") >= planned:
             more = done - record["n_timesteps"] + 1
-            to_go_on = f"sb3-htr train --resume {run} -n {more}"
+            to_go_on = shlex.join(["sb3-htr", "train", "--resume", str(run), "-n", str(more)])
             print(f"{run} is finished, after {done:,} env steps. To train further, by so many steps or more: {to_go_on}")
             return
         given = [*given_arguments(record["arguments"]), "--seed", str(record["seed"]), "-n", str(planned)]
@@ -98,10 +102,7 @@ def main(argv: Sequence[str]) -> None:
             raise ValueError("--env is missing: give the id of a task env, as in `sb3-htr train --env SparsePointRobot-v0`.")
         see_working_folder()  # for what -params and -conf name
         packages = ["--gym-packages", *args.gym_packages] if args.gym_packages else []
-        for i, (before, word) in enumerate(pairwise(rest), start=1):
-            if before in CONF and Path(word).exists():
-                rest[i] = str(Path(word).resolve())  # wherever the run goes on from
-        given = [*env, *rest, *packages]
+        given = [*env, *_from_anywhere(rest), *packages]
         try:
             find_hidden(args.env or "")
         except gym.error.UnregisteredEnv as error:
@@ -118,6 +119,17 @@ def main(argv: Sequence[str]) -> None:
         raise ValueError(
             f"{error}: the values of -params and --env-kwargs are Python, with strings in quotes, as in \"explorer:'prior'\"."
         ) from error
+
+
+def _from_anywhere(arguments: Sequence[str]) -> list[str]:
+    """The same with whole paths, as a run may go on from another folder."""
+    words = [part for word in arguments for part in (word.split("=", 1) if word.startswith(PATHS_EQUAL) else [word])]
+    for i, (option, word) in enumerate(pairwise(words), start=1):
+        if option in ("-tb", "--tensorboard-log") or (option in CONF and Path(word).exists()):
+            words[i] = str(Path(word).resolve())
+        elif option == "--storage":
+            words[i] = absolute(word)
+    return words
 
 
 def _check_id(env_id: str) -> None:

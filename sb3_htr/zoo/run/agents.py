@@ -4,6 +4,7 @@ import contextlib
 import difflib
 import json
 import os
+import shlex
 import sys
 import zipfile
 from collections.abc import Callable
@@ -226,7 +227,8 @@ def find_model(run: Path, env_id: str, which: str) -> Path:
     for path in (best, last) if which == "best" else (last, best):
         if path.exists():
             return path
-    advice = f"go on with `sb3-htr train --resume {run}`" if checkpoints(run) else "train anew, as it has no checkpoint either"
+    resume = shlex.join(["sb3-htr", "train", "--resume", str(run)])
+    advice = f"go on with `{resume}`" if checkpoints(run) else "train anew, as it has no checkpoint either"
     raise FileNotFoundError(f"{run} has no model yet, the first is saved with the first evaluation: {advice}.")
 
 

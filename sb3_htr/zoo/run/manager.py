@@ -8,6 +8,7 @@ import shutil
 import signal
 import sys
 import threading
+import traceback
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
@@ -21,6 +22,7 @@ from typing import Any, cast
 
 import optuna
 import rl_zoo3.train
+import yaml
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from rl_zoo3 import exp_manager
@@ -54,10 +56,15 @@ from sb3_htr.zoo.run.folder import SystemLock, claim, lock
 from sb3_htr.zoo.run.method import DEFAULT, PEARLMethod, get_method, merged, names_of
 from sb3_htr.zoo.run.search_space import convert_pearl_params, sample_pearl_params
 from sb3_htr.zoo.run.shipped import find_hyperparams
+from sb3_htr.zoo.run.storage import check_is_there
 from sb3_htr.zoo.run.trust import PACKAGES, check_arguments, plain_settings, refuse
 
 # What a YAML file may have beside the arguments of the algorithm
 ZOO_SETTINGS = ("n_envs", "n_timesteps", "env_wrapper", "vec_env_wrapper", "callback", "env_kwargs")
+
+
+# Of them, which may fall over a training: "lin_0.001"
+SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "delta_std")
 
 
 class MetaExperimentManager(ExperimentManager):
@@ -95,6 +102,8 @@ class MetaExperimentManager(ExperimentManager):
                 raise ValueError(
                     f"{self.config} is no file of hyperparameters: expected ids of envs, with settings."
                 ) from None
+            except yaml.YAMLError as error:
+                raise ValueError(f"{self.config} cannot be read: {' '.join(str(error).split())}.") from None
         in_file = hyperparams.pop("method", DEFAULT)
         in_params = given.pop("method", in_file)
         self.method = get_method(self._method_name or in_params)
@@ -103,7 +112,14 @@ class MetaExperimentManager(ExperimentManager):
         if self.optimize_hyperparameters and not isinstance(self.method, PEARLMethod):
             raise ValueError(f"The search is for settings of PEARL, and {self.method.name} has none: choose another --method.")
         checked = partial(plain_settings, trust=self.trust, named=self.args.gym_packages)
-        hyperparams = self.method.settings(checked(hyperparams, self.config))
+        hyperparams = checked(hyperparams, self.config)
+        _check_kinds(hyperparams, self.config)
+        if (otherwise := self.method.set_otherwise(hyperparams)) and self.resumed is None:
+            warnings.warn(
+                f"{self.config} has {', '.join(otherwise)}, which the method {self.method.name} replaces by its own: to have "
+                "them, give them by -params, or choose another --method."
+            )
+        hyperparams = self.method.settings(hyperparams)
         if self.resumed is not None:  # what a user gave comes from a file now
             given = checked(given, self.resumed / RECORD)
         self._given = given
@@ -114,24 +130,29 @@ class MetaExperimentManager(ExperimentManager):
             raise ValueError(
                 f"{self.config} has no {' and no '.join(missing)} for {self.env_name}: add it, as pearl.yml has it."
             )
+        _check_kinds(hyperparams, self.config)
         saved = OrderedDict(sorted(hyperparams.items()))
         print(f"Method {self.method.name}: {self.config} has the settings of the env. With those of the command line:")
         pprint(dict(saved))
         return hyperparams, saved
 
     def _check_study(self) -> None:
-        """Trials of several envs or methods have no best one, and settings of one are none of another."""
+        """Trials of several envs, methods or budgets have no best one, and settings of one are none of another."""
         assert self.storage is not None
         storage = JournalStorage(JournalFileBackend(self.storage)) if self.storage.endswith(".log") else self.storage
         try:
             study = optuna.load_study(study_name=self.study_name, storage=storage)
         except KeyError:  # it is said elsewhere that there is none
             return
-        for name, value in {"env": str(self.env_name.gym_id), "method": self.method.name}.items():
+        facts: dict[str, Any] = {"env": str(self.env_name.gym_id), "method": self.method.name}
+        if self.optimize_hyperparameters:
+            given = {"env-kwargs": self.env_kwargs, "n-timesteps": self.n_timesteps, "hyperparams": self._given}
+            facts |= {name: str(value) for name, value in given.items()}
+        for name, value in facts.items():
             # Older studies do not say
             if (known := study.user_attrs.get(name, value)) not in (value, "of the YAML file"):
                 raise ValueError(
-                    f"The study {study.study_name!r} is of {name} {known}, and not {value}: give --{name} {known}, or search "
+                    f"The study {study.study_name!r} is of {name} {known}, and not {value}: give --{name} as there, or search "
                     "under another --study-name."
                 )
             if self.optimize_hyperparameters:
@@ -148,6 +169,7 @@ class MetaExperimentManager(ExperimentManager):
             add = ", ".join(missing) or "another number"
             raise ValueError(f"A trial is named by {', '.join(named)}, from 0 on: add {add}.")
         assert self.storage is not None and self.study_name is not None
+        check_is_there(self.storage)
         self._check_study()
         try:
             trial: dict[str, Any] = self.load_trial(self.storage, self.study_name, trial_id)
@@ -356,6 +378,16 @@ class MetaExperimentManager(ExperimentManager):
             print(f"Trial {trial.number} is pruned: {error}")
             raise optuna.TrialPruned from error
 
+    def hyperparameters_optimization(self) -> None:
+        """Search. Where the report goes is looked at first."""
+        Path(self.log_folder, self.algo).mkdir(parents=True, exist_ok=True)
+        try:
+            super().hyperparameters_optimization()
+        except ValueError as error:
+            if all(frame.name != "best_trial" for frame in traceback.extract_tb(error.__traceback__)):
+                raise
+            print("none: no trial was finished. The same command goes on.")
+
     def _create_sampler(self, sampler_method: str) -> optuna.samplers.BaseSampler:
         sampler = super()._create_sampler(sampler_method)
         if self.storage is not None:  # workers of one study, with one command, must not draw alike
@@ -410,6 +442,26 @@ class MetaExperimentManager(ExperimentManager):
     def _write_record(self, record: dict[str, Any]) -> None:
         with atomic_path(Path(self.save_path) / RECORD) as path:
             path.write_text(json.dumps(record, indent=2, default=str))
+
+
+def _check_kinds(hyperparams: dict[str, Any], file: object) -> None:
+    """YAML takes 1e-3 for a text."""
+    for name, value in hyperparams.items():
+        if name.endswith("kwargs") and not isinstance(value, dict | None):
+            raise ValueError(f"{name} is {value!r} ({file}), expected names and values.")
+        number = value.removeprefix("lin_") if name in SCHEDULES and isinstance(value, str) else value
+        if name in (*SCHEDULES, "n_timesteps") and isinstance(number, str) and (number == value or not _is_number(number)):
+            raise ValueError(
+                f"{name} is the text {value!r} ({file}), expected a number: in YAML, 1.0e-3 is one, and 1e-3 is not."
+            )
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 @contextlib.contextmanager

@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 from sb3_htr.adaptation.explorers import EXPLORERS
-from sb3_htr.common.settings import keywords_of
+from sb3_htr.common.settings import check_numbers, keywords_of
 from sb3_htr.htr.relabel import RELABELLERS
 from sb3_htr.rivals.base import OwnWay
 from sb3_htr.zoo.run.algorithm import ALGORITHMS, Algorithm
@@ -45,6 +45,13 @@ class Method:
         :return: the same, joined with those of the method
         """
         return of_env
+
+    def set_otherwise(self, of_env: dict[str, Any]) -> list[str]:
+        """
+        :param of_env: hyperparameters of the env
+        :return: those that the method replaces by others, in words
+        """
+        return []
 
     def explorer_for(self, name: str) -> str:
         """
@@ -100,6 +107,16 @@ class PEARLMethod(Method):
                 of_env = {**of_env, key: {name: value for name, value in of_env[key].items() if name not in of_others}}
         return merged(of_env, self.hyperparams())
 
+    def set_otherwise(self, of_env: dict[str, Any]) -> list[str]:
+        buffer = of_env.get("replay_buffer_kwargs", {})
+        found = []
+        for name in ("explorer", "train_explorer", "relabeller", "relabel_probability", "rl_reward_type"):
+            theirs = {**of_env, **buffer}.get(name)
+            value = theirs.get("name") if isinstance(theirs, Mapping) else theirs
+            if value not in (None, getattr(self, name)):
+                found.append(f"{name} {value!r}")
+        return found
+
     def relabeller_settings(self) -> set[str]:
         """
         :return: names of the settings that its relabeller has
@@ -143,8 +160,8 @@ def register_method(name: str, **settings: Any) -> None:
     :raises ValueError: for a name that is taken, settings that are missing or not there, or an unknown relabeller, explorer
         or algorithm
     """
-    if name in methods():
-        raise ValueError(f"There is a method {name!r} already: choose another name.")
+    if not name or set(name) & set("/\\ "):
+        raise ValueError(f"The name of the method is {name!r}, expected one that can be the name of a folder.")
     try:
         method = _method(name, **settings)
     except TypeError as error:
@@ -154,14 +171,19 @@ def register_method(name: str, **settings: Any) -> None:
         "relabeller": RELABELLERS,
         "train_explorer": EXPLORERS,
         "explorer": EXPLORERS,
+        "rl_reward_type": ("sparse", "dense"),
     }
     for setting, known in kinds.items():
         value = getattr(method, setting, None)
-        if value is not None and value not in known:
+        if value is not None and value not in list(known):
             raise ValueError(f"The {setting} of the method {name!r} is {value!r}, expected one of {sorted(known)}.")
-    methods()[name] = method
+    new = [method]
     if isinstance(method, PEARLMethod):
-        methods()[f"{name}{PRIOR}"] = method.under_prior()
+        check_numbers(relabel_probability=(method.relabel_probability, 0.0, 1.0))
+        new.append(method.under_prior())
+    if taken := [each.name for each in new if each.name in methods()]:
+        raise ValueError(f"There is a method {taken[0]!r} already: choose another name.")
+    methods().update({each.name: each for each in new})
 
 
 def get_method(name: str) -> Method:
