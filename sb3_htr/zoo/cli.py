@@ -3,8 +3,10 @@
 import difflib
 import importlib
 import os
+import select
 import sys
 from collections.abc import Sequence
+from typing import TextIO
 
 import gymnasium
 import torch as th
@@ -88,10 +90,24 @@ def _nobody_reads() -> bool:
     """Whether who reads the output, as `head` does, has seen enough. Then nothing more is written at the end either."""
     try:
         sys.stdout.flush()
+        closed = _is_closed(sys.stdout)
     except BrokenPipeError:
+        closed = True
+    if closed:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return True
-    return False
+    return closed
+
+
+def _is_closed(stream: TextIO) -> bool:
+    """Whether nobody reads a pipe; of one that keeps nothing to itself, flushing does not tell."""
+    if not hasattr(select, "poll"):
+        return False
+    try:
+        poll = select.poll()
+        poll.register(stream, 0)
+    except (OSError, ValueError):  # no file, as where output is captured
+        return False
+    return any(event & select.POLLERR for _, event in poll.poll(0))
 
 
 def console() -> int:
@@ -114,6 +130,8 @@ def console() -> int:
         name = "" if isinstance(error, MISTAKES) else f"{type(error).__name__}: "
         print(f"sb3-htr: {name}{error}\n(SB3_HTR_TRACEBACK=1 in the environment shows where this comes from)", file=sys.stderr)
         return 1
+    finally:
+        _nobody_reads()
 
 
 if __name__ == "__main__":

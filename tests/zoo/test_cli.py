@@ -1,5 +1,7 @@
 """The command as a process."""
 
+import os
+import subprocess
 import sys
 
 import pytest
@@ -22,3 +24,16 @@ def test_a_command_takes_one_thread_unless_told_otherwise(monkeypatch: pytest.Mo
             assert th.get_num_threads() == expected
     finally:
         th.set_num_threads(before)
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("arguments", [["--version"], ["evaluate", "--help"]])
+def test_who_has_read_enough_is_told_nothing(arguments: list[str], unbuffered: str) -> None:
+    """As `sb3-htr ... | head -1` does; a container often buffers nothing."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "sb3_htr.zoo.cli", *arguments]
+    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, env=environment, check=False)
+    os.close(writer)
+    assert done.stderr == ""
