@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from helpers import ROLLOUT, MakePEARL
@@ -38,3 +39,15 @@ def test_the_profile_names_parts_that_are_called(tiny_pearl: MakePEARL, monkeypa
         monkeypatch.setattr(owner, attribute, noting(getattr(owner, attribute), where))
     model.learn(2 * ROLLOUT)
     assert called == set(importlib.import_module("profile_training").PARTS.values())
+
+
+def test_the_benchmark_of_rl2_has_both_policies(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    benchmark, written = importlib.import_module("rl2"), []
+    monkeypatch.setattr(
+        benchmark, "by_turns", lambda durations: {name: np.array([each()]) for name, each in durations.items()}
+    )
+    monkeypatch.setattr(benchmark, "seconds", lambda function, n: function() or 1.0)
+    monkeypatch.setattr(benchmark, "write", lambda name, figures: written.extend(figures))
+    benchmark.main()
+    assert [figure.ratio for figure in written] == [1.0]
