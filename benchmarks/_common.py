@@ -6,6 +6,7 @@ import platform
 import statistics
 import sys
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from datetime import date
@@ -113,7 +114,9 @@ def make_model(n_episodes_per_task: int = 60, relabel_probability: float = 0.8, 
     buffer = {"relabel_probability": relabel_probability, "context_episodes": 60}
     sizes = {"n_tasks_per_rollout": 16, "n_episodes_per_task": n_episodes_per_task, "learning_starts": 10**9}
     model = PEARL("MlpPolicy", env, replay_buffer_kwargs=buffer, seed=0, device="cpu", **{**sizes, **kwargs})
-    return model.learn(16 * 20 * n_episodes_per_task, log_interval=None)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Nothing was learnt")
+        return model.learn(16 * 20 * n_episodes_per_task, log_interval=None)
 
 
 def write(name: str, figures: list[Figure]) -> None:
