@@ -136,7 +136,7 @@ def test_yaml_files_run_no_code(key: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=rf"hostile.yml has {key}: .*, which can run any code: add --trust"):
         main(["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(file)])
     file.write_text(f"{ENV_ID}: !!python/object/apply:os.system ['touch {fuse}']")
-    with pytest.raises(yaml.YAMLError):
+    with pytest.raises(ValueError, match=r"hostile\.yml cannot be read"):
         main(["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(file)])
     assert not fuse.exists()
 

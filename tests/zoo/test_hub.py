@@ -130,7 +130,7 @@ def test_an_export_folder_is_this_model_and_nothing_else(hub: Hub, tmp_path: Pat
     with pytest.raises(ValueError, match=r"holds other files"):
         main([*arguments[:-1], "."])
     Path("shared", "thesis.tex").unlink()
-    with pytest.raises(ValueError, match="n_episodes is 0"):
+    with pytest.raises(ValueError, match="--n-episodes is 0"):
         main([*arguments, "--n-episodes", "0"])
     assert names("shared") == [".gitattributes", "README.md", MODEL], "nothing is lost by a slip"
 

@@ -129,7 +129,7 @@ def test_plot_draws_all_pictures_of_an_agent(tmp_path: Path, capsys: pytest.Capt
     assert {path.name for path in tmp_path.iterdir()} == names
     assert all(path.stat().st_size > 10_000 and "<svg" in path.read_text() for path in tmp_path.iterdir())
     assert "No learning curves" in capsys.readouterr().out
-    with pytest.raises(ValueError, match="n_episodes is 0, expected a whole number of at least 1"):
+    with pytest.raises(ValueError, match="--n-episodes is 0, expected a whole number of at least 1"):
         main(["plot", *NOWHERE, "--n-episodes", "0"])
 
 

@@ -103,7 +103,7 @@ def chosen_agent(parser: argparse.ArgumentParser, args: argparse.Namespace, path
     check_device(args.device)
     for name, limits in {"n_episodes": (1,), "seed": (0, MAX_SEED)}.items():
         if hasattr(args, name):
-            check_numbers(**{name: (getattr(args, name), *limits)})
+            check_numbers(**{f"--{name.replace('_', '-')}": (getattr(args, name), *limits)})
     import_packages(args.gym_packages)
     if path is not None:
         if args.exp_id or args.method:

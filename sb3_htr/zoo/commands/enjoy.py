@@ -50,7 +50,7 @@ def watch(agent: TrainedAgent, args: argparse.Namespace, every: int, show: Show)
     env = agent.make_env("rgb_array" if every else None)
     player = Player(model, env, args.explorer, not args.stochastic, args.seed, every, agent.around)
     tasks = task_set(get_task_family(player.vec_env), args.tasks)
-    check_numbers(**{"--n-episodes": (args.n_episodes, 1), "--n-tasks": (args.n_tasks, 1)})
+    check_numbers(**{"--n-tasks": (args.n_tasks, 1)})
     numbers = args.task or range(1, min(args.n_tasks, len(tasks)) + 1)
     wrong = [number for number in numbers if not 1 <= number <= len(tasks)]
     if wrong:
