@@ -267,6 +267,16 @@ def test_what_yaml_makes_of_a_slip(learning_rate: Any, n_timesteps: Any, more: s
     assert "\n" not in str(refusal.value) and not (tmp_path / "logs").exists()
 
 
+def test_keywords_may_be_python_where_the_file_is_trusted(tmp_path: Path) -> None:
+    block = {key: value for key, value in TINY.items() if key not in ("seed", "policy_kwargs")}
+    block |= {"policy": "MlpPolicy", "n_timesteps": 240, "n_envs": 4, "learning_rate": "lin_1e-3"}
+    block["policy_kwargs"] = "dict(net_arch=[16], encoder_arch=[16])"
+    (tmp_path / "my.yml").write_text(yaml.safe_dump({ENV_ID: block}))
+    arguments = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(tmp_path / "my.yml"), "--eval-freq", "-1"]
+    assert main([*arguments, "--verbose", "0", "--trust"]) == 0
+    assert PEARL.load(run_folder(tmp_path) / f"{ENV_ID}.zip").policy_kwargs["net_arch"] == [16]
+
+
 def test_no_method_replaces_another(monkeypatch: pytest.MonkeyPatch) -> None:
     known = dict(methods())
     monkeypatch.setattr("sb3_htr.zoo.run.method.methods", lambda: known)

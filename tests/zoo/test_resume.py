@@ -186,12 +186,12 @@ def test_a_run_goes_on_from_another_folder_than_it_was_begun_in(tmp_path: Path, 
     monkeypatch.chdir(tmp_path / "there")
     shutil.copy(hyperparams_file("pearl.yml"), "my.yml")
     arguments = [word if word != str(STEPS) else "480" for word in TRAIN]
-    assert main([*arguments, "-conf", "my.yml", "-f", "runs"]) == 0
+    assert main([*arguments, "-conf", "my.yml", "-f", "runs", "-tb", "tb"]) == 0
     run = run_folder(Path("runs").resolve())
     (run / f"{ENV_ID}.zip").unlink()
     monkeypatch.chdir(tmp_path)
     assert main(["train", "--resume", str(run)]) == 0
-    assert (run / f"{ENV_ID}.zip").exists()
+    assert (run / f"{ENV_ID}.zip").exists() and list(Path("there/tb").iterdir()) and not Path("tb").exists()
 
 
 def test_a_run_goes_on_where_the_package_lies_elsewhere(unbroken: Path, tmp_path: Path) -> None:

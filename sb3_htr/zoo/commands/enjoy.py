@@ -44,7 +44,7 @@ def watch(agent: TrainedAgent, args: argparse.Namespace, every: int, show: Show)
     :param every: takes every N-th frame of an episode, and the last one; 0 takes none
     :param show: called at every reset and step
     :return: last moment of each task
-    :raises ValueError: for a task or a number of episodes that there is not
+    :raises ValueError: for a task that there is not
     """
     model = agent.load(args.device)
     env = agent.make_env("rgb_array" if every else None)

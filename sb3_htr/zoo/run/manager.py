@@ -53,6 +53,7 @@ from sb3_htr.zoo.run.algorithm import Algorithm
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback, ProgressCallback
 from sb3_htr.zoo.run.defaults import given_arguments
 from sb3_htr.zoo.run.folder import SystemLock, claim, lock
+from sb3_htr.zoo.run.kinds import check_kinds
 from sb3_htr.zoo.run.method import DEFAULT, PEARLMethod, get_method, merged, names_of
 from sb3_htr.zoo.run.search_space import convert_pearl_params, sample_pearl_params
 from sb3_htr.zoo.run.shipped import find_hyperparams
@@ -61,10 +62,6 @@ from sb3_htr.zoo.run.trust import PACKAGES, check_arguments, plain_settings, ref
 
 # What a YAML file may have beside the arguments of the algorithm
 ZOO_SETTINGS = ("n_envs", "n_timesteps", "env_wrapper", "vec_env_wrapper", "callback", "env_kwargs")
-
-
-# Of them, which may fall over a training: "lin_0.001"
-SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "delta_std")
 
 
 class MetaExperimentManager(ExperimentManager):
@@ -113,7 +110,7 @@ class MetaExperimentManager(ExperimentManager):
             raise ValueError(f"The search is for settings of PEARL, and {self.method.name} has none: choose another --method.")
         checked = partial(plain_settings, trust=self.trust, named=self.args.gym_packages)
         hyperparams = checked(hyperparams, self.config)
-        _check_kinds(hyperparams, self.config)
+        check_kinds(hyperparams, self.config)
         if (otherwise := self.method.set_otherwise(hyperparams)) and self.resumed is None:
             warnings.warn(
                 f"{self.config} has {', '.join(otherwise)}, which the method {self.method.name} replaces by its own: to have "
@@ -130,7 +127,7 @@ class MetaExperimentManager(ExperimentManager):
             raise ValueError(
                 f"{self.config} has no {' and no '.join(missing)} for {self.env_name}: add it, as pearl.yml has it."
             )
-        _check_kinds(hyperparams, self.config)
+        check_kinds(hyperparams, self.config)
         saved = OrderedDict(sorted(hyperparams.items()))
         print(f"Method {self.method.name}: {self.config} has the settings of the env. With those of the command line:")
         pprint(dict(saved))
@@ -442,26 +439,6 @@ class MetaExperimentManager(ExperimentManager):
     def _write_record(self, record: dict[str, Any]) -> None:
         with atomic_path(Path(self.save_path) / RECORD) as path:
             path.write_text(json.dumps(record, indent=2, default=str))
-
-
-def _check_kinds(hyperparams: dict[str, Any], file: object) -> None:
-    """YAML takes 1e-3 for a text."""
-    for name, value in hyperparams.items():
-        if name.endswith("kwargs") and not isinstance(value, dict | None):
-            raise ValueError(f"{name} is {value!r} ({file}), expected names and values.")
-        number = value.removeprefix("lin_") if name in SCHEDULES and isinstance(value, str) else value
-        if name in (*SCHEDULES, "n_timesteps") and isinstance(number, str) and (number == value or not _is_number(number)):
-            raise ValueError(
-                f"{name} is the text {value!r} ({file}), expected a number: in YAML, 1.0e-3 is one, and 1e-3 is not."
-            )
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 @contextlib.contextmanager

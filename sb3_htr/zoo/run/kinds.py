@@ -1,0 +1,32 @@
+"""Says what is wrong where YAML makes of a setting something else than was meant."""
+
+from typing import Any
+
+# Of these rl_zoo3 makes a schedule, which may fall over a training: "lin_0.001"
+SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "delta_std")
+# These it evaluates as Python if they are texts, which files need --trust for
+MAY_BE_TEXT = ("policy_kwargs", "monitor_kwargs")
+
+
+def check_kinds(hyperparams: dict[str, Any], file: object) -> None:
+    """
+    :param hyperparams: settings
+    :param file: where they come from, for messages
+    :raises ValueError: for a text that was to be a number, as 1e-3 is to YAML, and for keywords that are none
+    """
+    for name, value in hyperparams.items():
+        is_text = isinstance(value, str)
+        if name.endswith("kwargs") and not isinstance(value, dict | None) and not (is_text and name in MAY_BE_TEXT):
+            raise ValueError(f"{name} is {value!r} ({file}), expected names and values.")
+        if is_text and (name == "n_timesteps" or (name in SCHEDULES and not _is_linear(value))):
+            raise ValueError(
+                f"{name} is the text {value!r} ({file}), expected a number: in YAML, 1.0e-3 is one, and 1e-3 is not."
+            )
+
+
+def _is_linear(text: str) -> bool:
+    try:
+        float(text.removeprefix("lin_"))
+    except ValueError:
+        return False
+    return text.startswith("lin_")
