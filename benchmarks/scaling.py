@@ -102,9 +102,20 @@ def milliseconds(function: Callable[[], Any]) -> float:
     return 1e3 * float(np.median(durations))
 
 
-def draw(model: PEARL) -> float:
-    """Of one meta-batch."""
+def first_look(model: PEARL) -> float:
+    """Of what relabelling asks of a step once, when it is first drawn, in microseconds."""
     assert model.replay_buffer is not None
+    episodes, memo = model.replay_buffer.episodes, model.replay_buffer.relabeller._demerits  # type: ignore[attr-defined]
+    parts = np.array_split(episodes.index().rows, len(episodes.index().rows) // 1000)
+    return 1e3 * float(np.median([milliseconds(partial(memo._ask, part)) for part in parts[:3]])) / len(parts[0])
+
+
+def draw(model: PEARL) -> float:
+    """Of one meta-batch, from steps that were looked at before."""
+    assert model.replay_buffer is not None
+    memo, episodes = model.replay_buffer.relabeller._demerits, model.replay_buffer.episodes  # type: ignore[attr-defined]
+    for part in np.array_split(episodes.index().rows, len(episodes.index().rows) // 1000):
+        memo.look_up(episodes, part)
     sizes = {"meta_batch_size": model.meta_batch_size, "context_size": model.context_size}
     return milliseconds(partial(model.replay_buffer.sample, model.batch_size, **sizes))
 
@@ -192,7 +203,14 @@ def measure() -> Iterator[tuple[str, list[int], Curves]]:
     yield (
         "training tasks",
         sizes,
-        curves(sizes, with_tasks, a_meta_batch=(ms, draw), the_index=(ms, index), an_episode_for_the_task_bank=(ms, bank)),
+        curves(
+            sizes,
+            with_tasks,
+            a_meta_batch=(ms, draw),
+            a_first_look_at_a_step=(us, first_look),
+            the_index=(ms, index),
+            an_episode_for_the_task_bank=(ms, bank),
+        ),
     )
     sizes = [100_000, 1_000_000, 10_000_000]
     yield "transitions in the replay", sizes, curves(sizes, with_transitions, a_meta_batch=(ms, draw), the_index=(ms, index))
