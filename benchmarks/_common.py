@@ -42,6 +42,8 @@ PAPER_SIZES: dict[str, Any] = {
         "normalize_observations": False,
     },
 }
+# Times that each of several things is timed, by turns
+ROUNDS = 9
 
 
 @dataclass
@@ -79,24 +81,23 @@ def seconds(function: Callable[[], Any], n: int) -> float:
     return (time.perf_counter() - start) / n
 
 
-def by_turns(durations: dict[str, Callable[[], float]], rounds: int = 9) -> dict[str, np.ndarray]:
+def by_turns(durations: dict[str, Callable[[], float]]) -> dict[str, np.ndarray]:
     """
     Time several things by turns, so that what else the machine does meets all of them.
 
     :param durations: each measures itself once
-    :param rounds: how often
-    :return: (rounds,) durations of each
+    :return: (ROUNDS,) durations of each
     """
     for duration in durations.values():
         duration()
-    times = [[duration() for duration in durations.values()] for _ in range(rounds)]
+    times = [[duration() for duration in durations.values()] for _ in range(ROUNDS)]
     return dict(zip(durations, np.array(times).T, strict=True))
 
 
 def faster(ours: np.ndarray, reference: np.ndarray) -> float:
     """
-    :param ours: (rounds,) durations
-    :param reference: (rounds,) durations
+    :param ours: (ROUNDS,) durations
+    :param reference: (ROUNDS,) durations
     :return: median ratio
     """
     return statistics.median(reference / ours)

@@ -22,7 +22,7 @@ from sb3_htr.zoo.plots.curves import finish
 from sb3_htr.zoo.plots.style import COLOURS
 
 ENV_ID = "Scaling-v0"
-PICTURES = Path(__file__).parents[1] / "docs"
+PICTURE = Path(__file__).parents[1] / "docs" / "cost.svg"
 # Seconds that a point takes, about, after its set-up
 PATIENCE = 0.5
 
@@ -231,14 +231,13 @@ def plot(panels: list[tuple[str, list[int], Curves]]) -> None:
     """
     :param panels: what :func:`measure` gives
     """
-    for suffix in ("svg", "png"):
-        figure, all_axes = plt.subplots(2, 3, figsize=(11, 7.2), layout="constrained")
-        for axes, (name, sizes, curves) in zip(all_axes.flat, panels, strict=True):
-            for colour, (what, (unit, values)) in zip(COLOURS, curves.items(), strict=False):
-                axes.loglog(sizes, values, "o-", color=colour, label=f"{what} ({unit})", markersize=4)
-            axes.set_xlabel(name)
-            axes.set_ylim(0.03, 2e4)
-        finish(figure, PICTURES / f"cost.{suffix}", "Duration as work grows, one thread; both axes are logarithmic")
+    figure, all_axes = plt.subplots(2, 3, figsize=(11, 7.2), layout="constrained")
+    for axes, (name, sizes, curves) in zip(all_axes.flat, panels, strict=True):
+        for colour, (what, (unit, values)) in zip(COLOURS, curves.items(), strict=False):
+            axes.loglog(sizes, values, "o-", color=colour, label=f"{what} ({unit})", markersize=4)
+        axes.set_xlabel(name)
+        axes.set_ylim(0.03, 2e4)
+    finish(figure, PICTURE, "Duration as work grows, one thread; both axes are logarithmic")
 
 
 def main() -> None:

@@ -4,7 +4,7 @@ import inspect
 import json
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -372,7 +372,7 @@ def test_a_method(own_module: str, tmp_path: Path, capsys: pytest.CaptureFixture
     packages = ["--gym-packages", own_module]
     assert main(train_arguments(tmp_path, 480, *packages, "--method", "half-half")) == 0
     run = run_folder(tmp_path, "half-half")
-    model = agent_at(run, "last", trust=True).load()
+    model = replace(agent_at(run, "last"), trusted=True).load()
     assert isinstance(model, PEARL)
     assert json.loads((run / RECORD).read_text())["method"] == "half-half"
     assert (model.explorer.name, model.train_explorer.name) == ("aggregate", "belief")

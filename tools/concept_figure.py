@@ -29,9 +29,9 @@ def on_circle(degrees: float, radius: float = 1.0) -> tuple[float, float]:
     return radius * float(np.cos(np.radians(degrees))), radius * float(np.sin(np.radians(degrees)))
 
 
-def walk(end: tuple[float, float], bend: float, n_steps: int = 8) -> np.ndarray:
-    """From the start to a point, not straight. Positions (n_steps + 1, 2)."""
-    share = np.linspace(0, 1, n_steps + 1)[:, None]
+def walk(end: tuple[float, float], bend: float) -> np.ndarray:
+    """From the start to a point, not straight, in eight steps. Positions (9, 2)."""
+    share = np.linspace(0, 1, 9)[:, None]
     return share * np.array(end) + bend * np.sin(np.pi * share) * np.array([-end[1], end[0]])
 
 

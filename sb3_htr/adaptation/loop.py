@@ -32,7 +32,7 @@ class Adapting(Protocol):
         ...
 
     def exploring(self) -> np.ndarray:
-        """(n_envs,) bool, whether nothing is known about the task yet but what was tried in vain."""
+        """(n_envs,) bool, whether it still explores, see :meth:`sb3_htr.adaptation.explorers.Explorer.exploring`."""
         ...
 
     def deviation(self) -> np.ndarray:

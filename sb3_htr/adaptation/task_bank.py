@@ -178,8 +178,7 @@ class TaskBank:
         self.check(state)
         for name in ARRAYS:
             setattr(self, name, state[name].cpu().numpy().copy())
-        # Older files have none, as nothing was left over between rollouts
-        self.new = [(task, episode.cpu().numpy().copy()) for task, episode in state.get("new", [])]
+        self.new = [(task, episode.cpu().numpy().copy()) for task, episode in state["new"]]
         set_generator_state(self._rng, state["random"])
 
     def rank(self, likelihood: np.ndarray) -> None:

@@ -265,7 +265,7 @@ def check_is_not_normalized(env: VecEnv) -> None:
         )
 
 
-OPTIONS = "its reset, or that of a wrapper around it, must hand on options."
+HAND_ON = "its reset, or that of a wrapper around it, must hand on options."
 
 
 def check_task_ids(env: VecEnv, asked: np.ndarray) -> None:
@@ -281,7 +281,7 @@ def check_task_ids(env: VecEnv, asked: np.ndarray) -> None:
         )
     given = [info["task_id"] for info in env.unwrapped.reset_infos]
     if given != asked.tolist():
-        raise ValueError(f"The env was asked for the tasks {asked.tolist()}, and is on {given}: {OPTIONS}")
+        raise ValueError(f"The env was asked for the tasks {asked.tolist()}, and is on {given}: {HAND_ON}")
 
 
 def check_tasks(env: VecEnv, asked: np.ndarray) -> None:
@@ -293,7 +293,7 @@ def check_tasks(env: VecEnv, asked: np.ndarray) -> None:
     if env.has_attr("task"):
         given = np.stack(env.get_attr("task"))
         if given.shape != asked.shape or not np.allclose(given, asked, rtol=1e-5, atol=1e-6):
-            raise ValueError(f"The env was asked for the task {asked[0]}, and is on {given[0]}: {OPTIONS}")
+            raise ValueError(f"The env was asked for the task {asked[0]}, and is on {given[0]}: {HAND_ON}")
 
 
 def check_device(device: th.device | str) -> None:

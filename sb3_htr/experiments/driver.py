@@ -13,7 +13,7 @@ from filelock import Timeout
 
 from sb3_htr.common.resume import n_steps_done
 from sb3_htr.experiments.cell import Cell
-from sb3_htr.experiments.runner import claim, run_cell
+from sb3_htr.experiments.runner import lock_of, run_cell
 
 # Failures of a cell without a new checkpoint in between, after which it is given up
 ATTEMPTS = 3
@@ -84,7 +84,7 @@ class Driver:
         if not cell.run_folder(self.runs).exists():
             return False
         try:
-            claim(cell, self.runs).acquire(timeout=0).lock.release()
+            lock_of(cell, self.runs).acquire(timeout=0).lock.release()
         except Timeout:
             return True
         return False

@@ -189,8 +189,8 @@ def relabelling(results: Results, path: Path) -> None:
         heights = np.stack([values[:n] for values in returns], axis=-1)
         band(left, np.array(probabilities), heights, COLOURS[0], "-", "IQM and 95 % interval")
     for k, values in zip(probabilities, returns, strict=True):
-        label = "one seed" if k == 0 else None
-        left.plot([k] * len(values), values.mean(axis=(1, 2)), "o", color=COLOURS[6], markersize=3, label=label)
+        text = "one seed" if k == 0 else None
+        left.plot([k] * len(values), values.mean(axis=(1, 2)), "o", color=COLOURS[6], markersize=3, label=text)
     left.set_xlabel("K, probability of relabelling")
     left.set_ylabel("return of the last adaptation episode")
     left.set_title("test tasks, final models", fontsize=10)
@@ -250,8 +250,8 @@ def reliability(results: Results, path: Path) -> None:
         if not bins.any():
             continue
         n, probability, successes = bins[bins[:, 0] > 0].T
-        label = f"{variant}: expected calibration error {expected_calibration_error(bins):.3f}"
-        axes.plot(probability / n, successes / n, "o-", color=colour, markersize=4, label=label)
+        text = f"{variant}: expected calibration error {expected_calibration_error(bins):.3f}"
+        axes.plot(probability / n, successes / n, "o-", color=colour, markersize=4, label=text)
     axes.set_xlabel("probability of success by the reward model")
     axes.set_ylabel("frequency of success")
     finish(figure, path, f"{next(iter(results)).env_id}: states and validation tasks of {n_seeds(results)} seeds", 1)

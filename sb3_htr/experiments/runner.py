@@ -31,7 +31,7 @@ from sb3_htr.zoo.run.trust import import_packages
 LOGGED = ("relabelled_fraction", "rl_reward_mean", "rl_zero_reward_fraction")
 
 
-def claim(cell: Cell, runs: Path) -> SystemLock:
+def lock_of(cell: Cell, runs: Path) -> SystemLock:
     """
     :param cell: of an experiment
     :param runs: folder of all experiments' runs
@@ -69,7 +69,7 @@ def run_cell(cell: Cell, runs: Path) -> bool:
     for path in (folder, result.parent):
         path.mkdir(parents=True, exist_ok=True)
     try:
-        with claim(cell, runs).acquire(timeout=0):
+        with lock_of(cell, runs).acquire(timeout=0):
             if result.exists():
                 cell.check_result(result)
             else:
@@ -99,10 +99,10 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
     advice = f"Its run has to be trained again: remove {folder}."
     evaluations = load_arrays(run / "evaluations.npz", ("timesteps", "results", "successes"), advice)
     progress = np.genfromtxt(run / "progress.csv", delimiter=",", names=True, deletechars="")
-    logged = progress.dtype.names or ()
+    columns = progress.dtype.names or ()
     record = read_record(run / RECORD)
     return {
-        **{key: np.nanmean(progress[f"train/{key}"]) if f"train/{key}" in logged else np.nan for key in LOGGED},
+        **{key: np.nanmean(progress[f"train/{key}"]) if f"train/{key}" in columns else np.nan for key in LOGGED},
         "timesteps": evaluations["timesteps"],
         "curve": evaluations["results"],
         "solved": evaluations["successes"][..., -1],

@@ -172,7 +172,7 @@ class EpisodeStore:
                 f"The saved episodes have {arrays['slots'].shape[1]} slots a task of shape {arrays['data'].shape[1:]}, this "
                 f"buffer has {self.episodes_per_task} of {self._data.shape[1:]}: use the settings that they were saved with."
             )
-        if arrays.get("in_order", self.in_order) != self.in_order:
+        if arrays["in_order"] != self.in_order:
             raise ValueError(
                 "Of the saved episodes and those of this model, one follows the order of time and the other does not: use the "
                 "settings that they were saved with."

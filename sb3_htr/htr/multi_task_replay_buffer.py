@@ -66,7 +66,6 @@ class MultiTaskReplayBuffer(ReplayBuffer):
     :param action_space: Box
     :param device: where samples are put
     :param n_envs: number of envs that :meth:`add` receives
-    :param optimize_memory_usage: for SB3's signature; must be False, episodes are stored whole
     :param task_family: the env's ``task_family``: reward hook and training tasks. Where it has no hook, as
         ``htr_envs.TaskDistribution`` has none, K must be 0
     :param max_episode_steps: time limit of the env
@@ -79,6 +78,8 @@ class MultiTaskReplayBuffer(ReplayBuffer):
     :param context_episodes: without relabelling, the context is drawn from this many latest episodes of the task (PEARL
         draws context from recently collected data)
     :param seed: seed of the buffer's own random generators
+    :raises ValueError: for a setting that is unknown or out of its range, a family without the hooks that it needs, and a
+        capacity below one episode of each task
     """
 
     def __init__(
@@ -88,7 +89,6 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         action_space: spaces.Space,
         device: th.device | str = "auto",
         n_envs: int = 1,
-        optimize_memory_usage: bool = False,
         *,
         task_family: TaskFamily,
         max_episode_steps: int,
@@ -105,8 +105,6 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         )
         if rl_reward_type not in ("sparse", "dense"):
             raise ValueError(f'rl_reward_type is {rl_reward_type!r}, expected "sparse" or "dense".')
-        if optimize_memory_usage:
-            raise ValueError("optimize_memory_usage is not supported: MultiTaskReplayBuffer stores whole episodes.")
         if relabel_probability > 0 or rl_reward_type == "dense":
             check_has_hooks(task_family)
         n_tasks = len(task_family.train_tasks)
@@ -118,8 +116,6 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             )
         # ReplayBuffer's own constructor would allocate everything at once
         BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_envs)
-        self.optimize_memory_usage = False
-        self.handle_timeout_termination = True
         self.task_family = task_family
         self.max_episode_steps = max_episode_steps
         self.relabel_probability = relabel_probability

@@ -78,8 +78,9 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
     :param replay_buffer_class: a MultiTaskReplayBuffer
     :param replay_buffer_kwargs: its arguments
     :param policy_kwargs: arguments of the policy
-    :param seed: seed of all random generators
+    :param seed: seed of all random generators, from 0 to 2**32 - 1
     :param kwargs: arguments of SAC
+    :raises ValueError: see :class:`sb3_htr.PEARL`
     """
 
     COUNTERS = (*Resumable.COUNTERS, "_n_rollouts")
@@ -467,8 +468,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         :return: chooses z and takes in what happens
         :raises ValueError: if the explorer goes by successes, and the model was trained on a family without
         """
-        own = to_explorer(self.explorer)
-        chosen = own if explorer in (None, own.name) else to_explorer(explorer)
+        chosen = self.explorer if explorer in (None, self.explorer.name) else to_explorer(explorer)
         self._check_explorer(chosen)
         check_numbers(n_envs=(n_envs, 1))
         return Adaptation(

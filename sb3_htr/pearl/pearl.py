@@ -46,8 +46,8 @@ class PEARL(OffPolicyMetaAlgorithm):
     :param batch_size: transitions per task for actor and critics, fewer where fewer are at hand, an episode or 24 by default
         (PEARL's reference: 256)
     :param tau: soft update of the target critics, in (0, 1] (PEARL's reference: 0.005)
-    :param gamma: discount, 1 - 2 / T for T steps of an episode by default, 0.98 at most (PEARL's reference for the sparse
-        point robot: 0.9, which it is there)
+    :param gamma: discount in [0, 1], 1 - 2 / T for T steps of an episode by default, 0.98 at most (PEARL's reference for the
+        sparse point robot: 0.9, which it is there)
     :param n_steps: steps whose rewards a return counts before the critics' value is asked for. Values reach further back with
         each update, but what was done in these steps counts, whatever the task that it was done for: by measurement, 3 is
         better than 5 on the ant. By default one for every 60 steps of an episode, from 1 to 10 (PEARL's reference: 1)
@@ -61,14 +61,15 @@ class PEARL(OffPolicyMetaAlgorithm):
     :param meta_batch_size: tasks per update (paper: 16)
     :param context_size: transitions per task for the context, fewer where fewer are at hand: under relabelling, at most an
         episode; an episode or 24 by default (PEARL's reference: 1024)
-    :param kl_coef: weight of the KL divergence of the posterior from N(0, I), summed over z's dimensions and averaged over
-        tasks, beside the critics' squared errors averaged over transitions (PEARL's reference, in these units: 0.0016)
-    :param final_kl_coef: to which this weight grows, or falls, by the end of training, by the same factor in equal times; it
-        stays what it is by default (PEARL's reference)
-    :param reward_coef: weight in z of the losses of the reward model, by which z learns to tell tasks apart; at 0, the model
-        learns and leaves z alone. By measurement, on a two-link arm (one seed): .91 of the tasks are solved at 0, .99 and more
-        at .5 and 2. It learns in each update: in one of four, at four times the weight, the Wheeled robot solves .90 of the
-        validation tasks in place of all (one seed)
+    :param kl_coef: 0 or more, weight of the KL divergence of the posterior from N(0, I), summed over z's dimensions and
+        averaged over tasks, beside the critics' squared errors averaged over transitions (PEARL's reference, in these units:
+        0.0016)
+    :param final_kl_coef: above 0, to which this weight grows, or falls, by the end of training, by the same factor in equal
+        times; it stays what it is by default (PEARL's reference)
+    :param reward_coef: 0 or more, weight in z of the losses of the reward model, by which z learns to tell tasks apart; at 0,
+        the model learns and leaves z alone. By measurement, on a two-link arm (one seed): .91 of the tasks are solved at 0,
+        .99 and more at .5 and 2. It learns in each update: in one of four, at four times the weight, the Wheeled robot solves
+        .90 of the validation tasks in place of all (one seed)
     :param n_tasks_per_rollout: training tasks per rollout, rounded up to a multiple of the envs, which all play
         (PEARL's reference: 10)
     :param n_episodes_per_task: episodes on each of them; by default as many as make up 400 steps, from 2 to 10
@@ -82,9 +83,11 @@ class PEARL(OffPolicyMetaAlgorithm):
     :param policy_kwargs: arguments of the policy: ``latent_dim``, ``net_arch``, ``encoder_arch`` (paper: 5, 3x300, 3x200),
         ``normalize_observations``
     :param verbose: 0 nothing, 1 info, 2 debug
-    :param seed: seed of all random generators
+    :param seed: seed of all random generators, from 0 to 2**32 - 1
     :param device: torch device
     :param _init_setup_model: build networks at once
+    :raises ValueError: for a setting that is unknown or out of its range, an env without a task family or a time limit, and
+        whatever else could not be trained on, each with what to do
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy}

@@ -8,7 +8,7 @@ import pytest
 from sb3_htr.adaptation import Aggregate, Belief, Explorer, Prior
 from sb3_htr.adaptation.explorers import EXPLORERS, to_explorer
 from sb3_htr.common.settings import make
-from sb3_htr.htr import EpisodeClustering, HindsightForesight, HindsightInference, Relabeller, SingleEpisodeRelabelling
+from sb3_htr.htr import Relabeller
 from sb3_htr.htr.relabel import RELABELLERS
 
 Kinds = Mapping[str, Callable[..., Any]]
@@ -52,9 +52,3 @@ def test_anything_else_is_answered_with_what_there_is(what: str, kinds: Kinds, b
 def test_a_setting_that_cannot_be_is_named(kinds: Kinds, base: Any, settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make("it", settings, kinds, base)
-
-
-def test_the_names_of_files_and_records_are_those_of_the_classes() -> None:
-    assert {name: explorer().name for name, explorer in EXPLORERS.items()} == {name: name for name in EXPLORERS}
-    assert {name: kind.__name__ for name, kind in RELABELLERS.items()} == {name: name for name in RELABELLERS}
-    assert set(RELABELLERS.values()) == {SingleEpisodeRelabelling, EpisodeClustering, HindsightForesight, HindsightInference}

@@ -20,7 +20,7 @@ from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.driver import ATTEMPTS, Driver
 from sb3_htr.experiments.executors import Here, Processes
 from sb3_htr.experiments.grid import EXPERIMENTS, Experiment, Variant
-from sb3_htr.experiments.runner import claim, run_cell
+from sb3_htr.experiments.runner import lock_of, run_cell
 from sb3_htr.zoo.cli import main
 
 CELLS = Experiment("toy", "", "SparsePointRobot-v0", 1000, (Variant("htr-ser"), Variant("htr-ec", "K = 0.8")), 3).cells()
@@ -73,7 +73,7 @@ def test_a_cell_that_runs_elsewhere_is_waited_for(trains: Any, tmp_path: Path) -
     trained = trains(lambda cell, folder: None)
     cell = CELLS[0]
     cell.run_folder(tmp_path).mkdir(parents=True)
-    with claim(cell, tmp_path):
+    with lock_of(cell, tmp_path):
         assert not run_cell(cell, tmp_path)
         waiting = threading.Thread(target=Driver([cell], tmp_path, Here()).run)
         waiting.start()
@@ -119,7 +119,7 @@ def test_progress_counts_cells_and_env_steps(tmp_path: Path, monkeypatch: pytest
     # A minute later
     now = time.monotonic() + 60
     monkeypatch.setattr(time, "monotonic", lambda: now)
-    with claim(running, tmp_path):
+    with lock_of(running, tmp_path):
         assert driver.line(driver.todo()) == "1 of 6 cells done, 1 running, 25 % of the env steps, 0:03:00 left"
         # The last rollout goes beyond the budget, and the evaluation is still to come
         (running.run_folder(tmp_path) / "htr-ec/run_1/checkpoints/1200_steps").mkdir()
@@ -145,7 +145,7 @@ def test_a_node_that_sees_another_folder_is_found_out(trains: Any, tmp_path: Pat
 
 
 def _hold(cell: Cell, runs: Path, held: Any) -> None:
-    with claim(cell, runs):
+    with lock_of(cell, runs):
         held.set()
         time.sleep(60)
 

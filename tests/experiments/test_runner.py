@@ -120,7 +120,7 @@ def test_the_command_repeats_an_experiment(
     assert {path.name for path in results.iterdir()} == {"tiny.png", "reliability.png", "summary.json", *raw}
     summary = json.loads((results / "summary.json").read_text())
     assert summary["command"] == "sb3-htr experiment tiny --quick --seeds 1", "what repeats these results"
-    coarse, plain = (agent_at(cell.run_folder(runs), trust=True) for cell in experiment.cells(1, 0.1))
+    coarse, plain = (replace(agent_at(cell.run_folder(runs)), trusted=True) for cell in experiment.cells(1, 0.1))
     assert (coarse.method, plain.method) == ("htr-ec", "pearl-sparse-prior")
     assert coarse.record["env_kwargs"] == {"goal_distance": 0.5, "n_test_tasks": 4} and coarse.record["n_timesteps"] == 960
     trained = coarse.load()

@@ -228,7 +228,6 @@ def test_what_a_relabeller_of_ones_own_remembers_is_of_one_model(tiny_pearl: Mak
         ({"rl_reward_type": "x"}, "rl_reward_type is 'x'"),
         ({"context_episodes": 0}, "context_episodes is 0"),
         ({"buffer_size": 100}, "too small for one episode"),
-        ({"optimize_memory_usage": True}, "optimize_memory_usage is not supported"),
         ({"relabeller": "Nobody"}, r"relabeller is 'Nobody', expected one of \['EpisodeClustering', 'Hindsight"),
         ({"relabeller": {"cell_size": 0.1}}, "relabeller is {'cell_size': 0.1}, expected one of"),
         ({"relabeller": None}, "relabeller is None, expected one of"),

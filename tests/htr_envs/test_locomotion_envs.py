@@ -56,25 +56,6 @@ def test_a_batch_of_one_is_the_single_env_over_several_episodes(env_id: str) -> 
 
 
 @both_envs
-@pytest.mark.parametrize("n_threads", [1, 2])
-def test_copies_put_into_the_states_of_single_envs_agree_with_them(env_id: str, n_threads: int) -> None:
-    singles = [make(env_id) for _ in range(5)]
-    vector = make_vec(env_id, 5, n_threads=n_threads)
-    vector.reset()
-    for i, (env, base) in enumerate(singles):
-        env.reset(seed=i, options={"task": [0.01 * i, 0.0]})
-        robots(vector).states[i] = robots(base).states[0]
-        vector._tasks[i] = base.task
-    for actions in random_actions(vector, 150):
-        observations, rewards, terminated, _, infos = vector.step(actions)
-        for i, (env, _) in enumerate(singles):
-            observation, reward, done, _, info = env.step(actions[i])
-            np.testing.assert_array_equal(observations[i], observation)
-            assert (rewards[i], terminated[i]) == (reward, done)
-            assert infos["task_free_reward"][i] == info["task_free_reward"]
-
-
-@both_envs
 def test_the_number_of_threads_changes_nothing(env_id: str) -> None:
     episodes = []
     for n_threads in (1, 2, 5):

@@ -410,7 +410,3 @@ def test_a_scalar_that_is_no_index_is_no_task(tiny_pearl: MakePEARL) -> None:
 def test_every_argument_is_documented() -> None:
     for name in inspect.signature(PEARL.__init__).parameters:
         assert name == "self" or f":param {name}:" in (PEARL.__doc__ or ""), name
-
-
-def test_tiny_settings_are_real_arguments() -> None:
-    assert TINY.keys() <= inspect.signature(PEARL.__init__).parameters.keys()

@@ -15,7 +15,7 @@ import torch as th
 from stable_baselines3.common.utils import LinearSchedule
 
 import sb3_htr
-from helpers import ENV_ID, MakePEARL, with_policy
+from helpers import ENV_ID, MakePEARL
 from helpers.runs import NOWHERE, SHIPPED, make_run, run_folder
 from sb3_htr import PEARL, load_untrusted
 from sb3_htr.adaptation.evaluation import AdaptationRecord, record_adaptation
@@ -226,18 +226,6 @@ def test_an_explorer_named_by_its_record_is_the_agents_own(explorer: Any, tmp_pa
     assert isinstance(model, PEARL)
     assert model.start_adaptation(1, "belief").explorer.margin == model.explorer.margin  # type: ignore[attr-defined]
     assert main(["plot", str(run), str(run), "-l", "A", "B", "-o", str(tmp_path / "x.png")]) == 0
-
-
-def test_normalized_agents_are_exported_with_their_statistics(tmp_path: Path, tiny_pearl: MakePEARL) -> None:
-    model = tiny_pearl(policy_kwargs=with_policy(normalize_observations=True)).learn(480)
-    make_run(tmp_path / "logs", model)
-    assert main(["export", str(tmp_path / "logs"), "-o", str(tmp_path / "agent.zip")]) == 0
-    exported = agent_at(tmp_path / "agent.zip").load()
-    assert isinstance(exported, PEARL)
-    assert exported.policy.normalizer is not None and exported.policy.normalizer.count > 479
-    records = [record_adaptation(agent, ENV_ID, n_episodes=2) for agent in (model, exported)]
-    np.testing.assert_array_equal(records[0].achieved, records[1].achieved)
-    assert main(["enjoy", str(tmp_path / "agent.zip"), "--no-render", "--n-tasks", "1", "--n-episodes", "2"]) == 0
 
 
 @pytest.mark.parametrize("defaults", [["--save-freq", "20000"], ["--save-freq", "20000", "--eval-episodes", "20"]])

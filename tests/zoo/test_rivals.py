@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,7 @@ def test_all_commands_take_them(method: str, runs: Path, tmp_path: Path, capsys:
     run = run_folder(runs, method)
     assert json.loads((run / RECORD).read_text())["method"] == method
     # Without pickle, as with it
-    agents = [agent_at(run, "last", trust=trust) for trust in (False, True)]
+    agents = [replace(agent_at(run, "last"), trusted=trust) for trust in (False, True)]
     records = [evaluate_adaptation(agent.load(), ENV_ID, n_episodes=2) for agent in agents]
     np.testing.assert_array_equal(records[0], records[1])
     few = ["--n-episodes", "2"]

@@ -6,12 +6,7 @@ from sb3_htr.adaptation.explorers.prior import FixedExploration, Prior
 from sb3_htr.common.settings import make
 
 # For YAML files
-EXPLORERS: dict[str, type[Explorer]] = {
-    "belief": Belief,
-    "prior": Prior,
-    "learned-prior": LearnedPrior,
-    "aggregate": Aggregate,
-}
+EXPLORERS: dict[str, type[Explorer]] = {kind().name: kind for kind in (Belief, Prior, LearnedPrior, Aggregate)}
 
 
 def to_explorer(explorer: object) -> Explorer:

@@ -21,16 +21,17 @@ class Aggregate(Explorer):
     Meta-training sees contexts of one rewarded episode; the misses of a search would look like nothing that the encoder knows.
     So the posterior is over the best episode alone.
 
-    :param scale: standard deviations of the aggregate are multiplied by this, so that exploration reaches beyond what was
-        visited so far. By measurement: at 1.0 the search of the Point Robot stops growing early
-    :param max_setbacks: episodes that may be worse than the best one, before the z of that one is acted with again. The
-        posterior of an episode that only grazed its goal can be narrow and beside it, so each setback widens it by its
+    :param scale: 0 or more; standard deviations of the aggregate are multiplied by this, so that exploration reaches beyond
+        what was visited so far. By measurement: at 1.0 the search of the Point Robot stops growing early
+    :param max_setbacks: 0 or more episodes that may be worse than the best one, before the z of that one is acted with again.
+        The posterior of an episode that only grazed its goal can be narrow and beside it, so each setback widens it by its
         deviation. By measurement on the Point Robot (two models, 200 tasks drawn anew), last return with 4 and with 6 12.9 and
         12.8; without the training tasks 12.2 and 12.3
-    :param clearly_better: an episode counts as no setback if it is better than the best one by this factor. The same z does
-        not return the same from every start, and of many episodes one is a little better. By measurement: on the Wheeled robot
-        (two models, 40 tasks drawn anew) all tasks are solved in the last episode with 1.02, 90 and 97 % with 1, because the
-        agent never settled
+    :param clearly_better: an episode counts as no setback if it is better than the best one by this factor, at least 1. The
+        same z does not return the same from every start, and of many episodes one is a little better. By measurement: on the
+        Wheeled robot (two models, 40 tasks drawn anew) all tasks are solved in the last episode with 1.02, 90 and 97 % with 1,
+        because the agent never settled
+    :raises ValueError: for a setting out of its range
     """
 
     needs_success: ClassVar[bool] = True

@@ -66,7 +66,8 @@ class Explorer(ABC):
     @abstractmethod
     def exploring(self) -> np.ndarray:
         """
-        :return: (n_envs,) bool, whether nothing is known about the task yet but what was tried in vain
+        :return: (n_envs,) bool, whether it still explores: until the first reward with ``belief`` and ``aggregate``, for
+            ``n_exploration_episodes`` episodes with ``prior`` and ``learned-prior``
         """
 
     def deviation(self) -> np.ndarray:

@@ -33,10 +33,11 @@ class Belief(ParticleExplorer):
     episode begins elsewhere each time, a z that was good may be a bad one: an episode that is not rewarded and whose value, as
     it goes on, is not what it was at the start, searches on to its end.
 
-    :param margin: a particle must promise so many times what the best episode returned, to be tried in its place
-    :param kept: when an episode with one z keeps its word: of what was found, the share that it must return to end the search;
-        of what the critics promised at its start, the share that they must still promise as long as it is unrewarded. By
-        measurement, docs/trials.md
+    :param margin: a particle must promise so many times what the best episode returned, to be tried in its place; 0 or more
+    :param kept: in [0, 1], when an episode with one z keeps its word: of what was found, the share that it must return to end
+        the search; of what the critics promised at its start, the share that they must still promise as long as it is
+        unrewarded. By measurement, docs/trials.md
+    :raises ValueError: for a setting out of its range
     """
 
     margin: float = 1.02

@@ -20,7 +20,8 @@ class LearnedPrior(FixedExploration, ParticleExplorer):
     tasks. z is drawn from it for a fixed number of episodes, and then from the posterior over all episodes, their misses
     included. One z an episode.
 
-    :param n_exploration_episodes: episodes before the posterior is used (PEARL's reference, num_exp_traj_eval: 5)
+    :param n_exploration_episodes: 0 or more episodes before the posterior is used (PEARL's reference, num_exp_traj_eval: 5)
+    :raises ValueError: if it is negative
     """
 
     def __post_init__(self) -> None:

@@ -26,9 +26,10 @@ class ParticleExplorer(Explorer):
 
     Nothing else is used than observations, actions and rewards.
 
-    :param doubt: smallest likelihood that the model is believed: of a success where it excludes one, of none where it is sure
-        of one, and of a reward beside the one expected. By measurement, docs/trials.md
-    :param temperature: power of each step's likelihood: steps of an episode are not independent
+    :param doubt: from 1e-6 to .5, smallest likelihood that the model is believed: of a success where it excludes one, of none
+        where it is sure of one, and of a reward beside the one expected. By measurement, docs/trials.md
+    :param temperature: in [0, 1], power of each step's likelihood: steps of an episode are not independent
+    :raises ValueError: for a setting out of its range
     """
 
     needs_success: ClassVar[bool] = True

@@ -8,10 +8,7 @@ from sb3_htr.htr.relabel.training_task import TrainingTaskRelabelling
 
 # For YAML files
 RELABELLERS: dict[str, type[Relabeller]] = {
-    "SingleEpisodeRelabelling": SingleEpisodeRelabelling,
-    "EpisodeClustering": EpisodeClustering,
-    "HindsightForesight": HindsightForesight,
-    "HindsightInference": HindsightInference,
+    kind.__name__: kind for kind in (SingleEpisodeRelabelling, EpisodeClustering, HindsightForesight, HindsightInference)
 }
 
 __all__ = [

@@ -121,10 +121,11 @@ def chosen_agent(parser: argparse.ArgumentParser, args: argparse.Namespace, path
         agent = agent_for(args.env, args.folder, args.method, args.exp_id, args.model)
     else:
         parser.error("say which agent: a run folder or model file, or --env ID")
-    if ":" in agent.env_id and not args.trust:
-        raise refuse(agent.path, f"is for the env {agent.env_id!r}")
+    if not args.trust:
+        if ":" in agent.env_id:
+            raise refuse(agent.path, f"is for the env {agent.env_id!r}")
+        check_env_kwargs(agent.record["env_kwargs"], agent.path, args.gym_packages)
     import_packages(args.gym_packages, agent.record["gym_packages"], agent.path, args.trust)
-    check_env_kwargs(agent.record["env_kwargs"], agent.path, args.trust, args.gym_packages)
     find_hidden(agent.env_id)
     kwargs = {**agent.record["env_kwargs"], **args.env_kwargs}
     return dataclasses.replace(agent, record={**agent.record, "env_kwargs": kwargs}, trusted=args.trust)

@@ -232,14 +232,11 @@ def find_model(run: Path, env_id: str, which: str) -> Path:
     raise FileNotFoundError(f"{run} has no model yet, the first is saved with the first evaluation: {advice}.")
 
 
-def agent_at(
-    path: str | os.PathLike[str], which: str = "best", env_id: str | None = None, trust: bool = False
-) -> TrainedAgent:
+def agent_at(path: str | os.PathLike[str], which: str = "best", env_id: str | None = None) -> TrainedAgent:
     """
     :param path: a run folder, a folder of runs, of which the newest is meant, an exported folder, or a model file
     :param which: ``"best"`` or ``"last"`` model of a run
     :param env_id: env of a model file without a record
-    :param trust: whether its files may have code run
     :return: the agent
     :raises FileNotFoundError: if there is none
     :raises ValueError: if it is no model file, or one that does not say its env
@@ -251,7 +248,7 @@ def agent_at(
     if path.is_dir():
         run = runs_with_models(path)[-1]
         record = read_record(run / RECORD)
-        return TrainedAgent(find_model(run, record["env_id"], which), record, run, trust)
+        return TrainedAgent(find_model(run, record["env_id"], which), record, run)
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist: give a run folder, a folder of runs, or a model file (.zip).")
     names: list[str] = []
@@ -260,14 +257,14 @@ def agent_at(
         if RECORD in names and archive.getinfo(RECORD).file_size > MAX_RECORD:
             raise ValueError(f"The {RECORD} in {path} unpacks to more than {MAX_RECORD} bytes, which no training writes.")
         if RECORD in names:
-            return TrainedAgent(path, read_record(path, archive.read(RECORD)), None, trust)
+            return TrainedAgent(path, read_record(path, archive.read(RECORD)), None)
     if "data" not in names:
         raise ValueError(f"{path} is no model file: give a run folder, or a .zip that a training has saved.")
     if (path.parent / RECORD).exists():
-        return TrainedAgent(path, read_record(path.parent / RECORD), path.parent, trust)
+        return TrainedAgent(path, read_record(path.parent / RECORD), path.parent)
     if env_id is None:
         raise ValueError(f"{path} does not say which env it was trained on: add --env ID.")
-    return TrainedAgent(path, {"env_id": env_id, "env_kwargs": {}, "gym_packages": []}, None, trust)
+    return TrainedAgent(path, {"env_id": env_id, "env_kwargs": {}, "gym_packages": []}, None)
 
 
 def agent_for(

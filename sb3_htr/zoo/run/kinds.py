@@ -3,9 +3,9 @@
 from typing import Any
 
 # Of these rl_zoo3 makes a schedule, which may fall over a training: "lin_0.001"
-SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "delta_std")
+SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf")
 # These it evaluates as Python if they are texts, which files need --trust for
-MAY_BE_TEXT = ("policy_kwargs", "monitor_kwargs")
+MAY_BE_TEXT = ("policy_kwargs",)
 
 
 def check_kinds(hyperparams: dict[str, Any], file: object) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 PACKAGES = ("htr_envs", "gymnasium_robotics", "metaworld", "panda_gym")
 # Settings of a YAML file that rl_zoo3 imports by their names, and those that it evaluates as Python if they are strings
 IMPORTED = ("callback", "env_wrapper", "vec_env_wrapper", "replay_buffer_class")
-EVALUATED = ("policy_kwargs", "replay_buffer_kwargs", "monitor_kwargs")
+EVALUATED = ("policy_kwargs", "replay_buffer_kwargs")
 # Arguments of a training whose values rl_zoo3 evaluates as Python, key by key
 KEY_VALUES = ("-params", "--hyperparams", "--env-kwargs", "--eval-env-kwargs")
 CONF = ("-conf", "--conf-file")
@@ -54,7 +54,7 @@ def plain_settings(hyperparams: dict[str, Any], file: object, trust: bool, named
     for key in IMPORTED:
         if hyperparams.get(key) is not None:
             raise refuse(file, f"has {key}: {hyperparams[key]!r}")
-    check_env_kwargs(hyperparams.get("env_kwargs"), file, trust, named)
+    check_env_kwargs(hyperparams.get("env_kwargs"), file, named)
     if "." in str(hyperparams.get("policy", "")):
         raise refuse(file, f"has policy: {hyperparams['policy']!r}")
     for key in EVALUATED:
@@ -85,7 +85,7 @@ def check_arguments(
             key, _, value = word.partition(":")
             refused = not _is_literal(value)
             if not refused:
-                check_env_kwargs({key: ast.literal_eval(value)}, file, trust, named)
+                check_env_kwargs({key: ast.literal_eval(value)}, file, named)
         else:
             refused = (option in CONF and Path(word).suffix not in (".yml", ".yaml")) or (
                 option == "--gym-packages" and word not in packages
@@ -94,11 +94,10 @@ def check_arguments(
             raise refuse(file, f"has the argument {word!r}")
 
 
-def check_env_kwargs(env_kwargs: Any, file: object, trust: bool, named: Iterable[str] = ()) -> None:
+def check_env_kwargs(env_kwargs: Any, file: object, named: Iterable[str] = ()) -> None:
     """
     :param env_kwargs: of a file. A text ``module:id``, with dots and underscores, is an env whose module would be imported
     :param file: for messages
-    :param trust: whether it may have code run
     :param named: modules that the user has named
     :raises ValueError: if code would be run
     """
@@ -106,8 +105,8 @@ def check_env_kwargs(env_kwargs: Any, file: object, trust: bool, named: Iterable
         env_kwargs = [*env_kwargs.values()]
     if isinstance(env_kwargs, list | tuple):
         for value in env_kwargs:
-            check_env_kwargs(value, file, trust, named)
-    elif isinstance(env_kwargs, str) and not trust:
+            check_env_kwargs(value, file, named)
+    elif isinstance(env_kwargs, str):
         module, colon, _ = env_kwargs.rpartition(":")
         if colon and module not in (*PACKAGES, *named):
             raise refuse(file, f"has {env_kwargs!r} among its settings")

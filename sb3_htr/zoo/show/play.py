@@ -25,7 +25,7 @@ class Moment:
     :param step: steps of the episode so far, 0 at the reset
     :param returns: of the episodes so far, the current one last
     :param successes: whether each of them solved the task so far
-    :param exploring: whether no reward of the task was found before this episode
+    :param exploring: whether the agent still explored when this episode began, see :meth:`Explorer.exploring`
     :param deviation: standard deviation of what is known about z, mean over its dimensions; NaN for an agent without z
     :param ended: whether the episode ends here
     :param frame: (height, width, 3) uint8, None where none was taken
