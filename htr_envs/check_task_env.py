@@ -375,12 +375,45 @@ def _check_bad_options(env: gym.Env[Any, Any], family: TaskFamily) -> None:
         raise AssertionError(f"reset takes options={options}: it must raise a ValueError.")
 
 
+def _check_id(env: gym.Env[Any, Any], family: TaskFamily, seed: int) -> None:
+    spec = copy.deepcopy(env.spec)
+    assert spec is not None
+    spec.additional_wrappers = ()  # they change nothing that is looked at here
+    spec.kwargs.pop("render_mode", None)  # nobody looks on, and batches have none
+    twins: list[Any] = [_call("The env cannot be made a second time by its id.", gym.make, spec).unwrapped]
+    if spec.vector_entry_point is not None:
+        mode = gym.VectorizeMode.VECTOR_ENTRY_POINT
+        twins.append(_call("The batch of the id cannot be made.", lambda: gym.make_vec(spec, 1, vectorization_mode=mode)))
+        _check_batch(twins[-1], env, family, seed)
+    for twin in twins:
+        for name in TASK_SETS:
+            told = f"Another env of the same id has other {name}: draw them with a generator whose seed is an argument."
+            _require(_same(getattr(twin.task_family, name), getattr(family, name)), told)
+        twin.close()
+
+
+def _check_batch(batch: Any, env: gym.Env[Any, Any], family: TaskFamily, seed: int) -> None:
+    episode = _play(env, family, seed, family.train_tasks[0])
+    options = {"task_id": np.zeros(1, dtype=np.int64)}
+    observations, _ = _call("The batch of the id fails in a reset.", lambda: batch.reset(seed=seed, options=options))
+    if not _same(observations[0], episode.traj.observations[0]):
+        return  # starts that are drawn in another way: nothing can be compared
+    for action, expected, reward in zip(episode.traj.actions, episode.traj.next_observations, episode.rewards, strict=True):
+        _, told, terminated, truncated, infos = _call("The batch of the id fails in a step.", batch.step, action[None])
+        same = _same(infos["final_obs"][0], expected) and _same(told[0], reward)
+        _require(same, "The batch of the id gives another episode than the env itself, from the same start.")
+        if terminated[0] or truncated[0]:
+            return
+
+
 def check_task_env(env: gym.Env[Any, Any], n_episodes: int = 3, seed: int = 0) -> None:
     """Run random episodes and fail at the first promise of a task family that the env breaks.
 
     The promises are those of :class:`htr_envs.TaskEnv` and :class:`htr_envs.TaskFamily`, or, where the family has no rewards,
     those of :class:`htr_envs.MetaEnv` and :class:`htr_envs.TaskDistribution`. Numbers are compared up to float32
     rounding. Run gymnasium's ``check_env`` as well: this function does not repeat it. The env is left without a given task.
+
+    An env that was made by its id is made once more, and as a batch, where the id has one of its own.
 
     :param env: the env with its time limit, wrapped or not; wrappers must not change observations, actions or rewards.
     :param n_episodes: number of random episodes to check.
@@ -394,4 +427,6 @@ def check_task_env(env: gym.Env[Any, Any], n_episodes: int = 3, seed: int = 0) -
         check_episode(env, family, seed + episode)
     _check_task_rules(env, family)
     _check_bad_options(env, family)
+    if env.spec is not None:
+        _check_id(env, family, seed)
     env.unwrapped.set_task(None)  # type: ignore[attr-defined]

@@ -138,11 +138,12 @@ class HiddenGoalEnv(TaskEnv):
 
     ### Termination
 
-    Where the GoalEnv ends, unless it ends because its own goal is reached, which means nothing here.
+    Where the GoalEnv ends, unless it ends because its own goal is reached, which means nothing here: then it is stepped on, so
+    it must not refuse that.
 
     ### Truncation
 
-    After as many steps as in the GoalEnv.
+    After as many steps as in the GoalEnv, or where it truncates an episode itself.
 
     ## Arguments
 
@@ -187,6 +188,7 @@ class HiddenGoalEnv(TaskEnv):
         shown = {"render_modes": modes, "render_fps": env.metadata.get("render_fps", 25)}
         self.metadata = {**self.metadata, **shown}  # type: ignore[misc]
         self.render_mode = render_mode
+        self._truncated = False  # by the GoalEnv, in its latest step
         # An episode is its seed and its actions: with them, a copy plays it again, as simulations can rarely be copied
         self._seed, self._actions = 0, list[NDArray[Any]]()
         self._env: gym.Env[Any, Any] | None = None
@@ -210,9 +212,18 @@ class HiddenGoalEnv(TaskEnv):
             self._env = self.task_family.source.make()
             self._follow(self._env, NOT_BEGUN)
         self._actions.append(np.clip(action, self.action_space.low, self.action_space.high))
-        observation, _, terminated, _, _ = self._env.step(self._actions[-1].copy())
+        observation, _, terminated, self._truncated, _ = self._env.step(self._actions[-1].copy())
         own_end = terminated and self.task_family.reached(observation["achieved_goal"], observation["desired_goal"])
         return self._observe(observation), 0.0, bool(terminated and not own_end)
+
+    def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
+        """Do one step; the time limit is left to the TimeLimit wrapper.
+
+        :param action: the action, shape (act_dim,).
+        :return: next observation (obs_dim,), reward, terminated, whether the GoalEnv was truncated, info.
+        """
+        observation, reward, terminated, _, info = super().step(action)
+        return observation, reward, terminated, bool(self._truncated), info
 
     def _follow(self, env: gym.Env[Any, Any], n_steps: int) -> None:
         """Play the episode in an env that has done so many steps of it."""

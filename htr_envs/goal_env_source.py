@@ -250,10 +250,12 @@ def _check_steps(source: GoalEnvSource) -> None:
     env.action_space.seed(0)
     env.reset(seed=0)
     for _ in range(N_STEPS):
-        observation, reward, *_ = env.step(env.action_space.sample())
+        observation, reward, terminated, truncated, _ = env.step(env.action_space.sample())
         expected = float(goal_rewards(source, observation["achieved_goal"], observation["desired_goal"]))
         if float(reward) != expected:
             raise ValueError(
                 f"A step of {source.spec.id} gave the reward {float(reward):.3g}, but compute_reward gives {expected:.3g} "
                 "without infos: a reward must depend on achieved and desired goal alone."
             )
+        if terminated or truncated:
+            env.reset()

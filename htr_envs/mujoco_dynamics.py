@@ -33,6 +33,8 @@ FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 FRAME_WIDTH, FRAME_HEIGHT = 640, 400
 # From behind the start, looking down on the semicircle of goals
 CAMERA = {"lookat": np.array([0.0, 0.9, 0.0]), "distance": 4.8, "azimuth": 90.0, "elevation": -45.0}
+# Threads of a process that this one was forked from
+LOST: list[Any] = []
 
 
 class MujocoDynamics(Dynamics[PositionGoalFamily]):
@@ -90,6 +92,7 @@ class MujocoDynamics(Dynamics[PositionGoalFamily]):
         self._next_states = np.zeros((num_envs, self.frame_skip, n_state))
         self._sensors = np.zeros((num_envs, self.frame_skip, self.model.nsensordata))
         self._rollout: tuple[Rollout, list[mujoco.MjData]] | None = None
+        self._process = os.getpid()  # that started the threads
         self._renderer: tuple[Any, mujoco.MjData] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -100,7 +103,12 @@ class MujocoDynamics(Dynamics[PositionGoalFamily]):
         return self.observe(self.states[indices])
 
     def step(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        if self._rollout is not None and self._process != os.getpid():
+            # a fork has no threads of its parent, and would wait for them, here or where they are put away
+            LOST.append(self._rollout)
+            self._rollout = None
         if self._rollout is None:
+            self._process = os.getpid()
             # with one thread the calling one does the work
             threads = Rollout(nthread=self.n_threads if self.n_threads > 1 else 0)
             self._rollout = threads, [mujoco.MjData(self.model) for _ in range(self.n_threads)]

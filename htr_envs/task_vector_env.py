@@ -94,8 +94,8 @@ class TaskVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]], ABC):
     def set_task(self, tasks: ArrayLike | None, indices: ArrayLike | None = None) -> None:
         """Choose the tasks of the episodes from the next reset of each copy on.
 
-        :param tasks: indices into ``train_tasks``, shape (n,), or vectors, shape (n, task_dim), one for each copy meant; or
-            None to draw a training task at each reset.
+        :param tasks: indices into ``train_tasks``, shape (n,), or vectors, shape (n, task_dim), one for each copy meant; one
+            index for all of them; or None to draw a training task at each reset.
         :param indices: which copies are meant, ints (n,) or a mask (num_envs,); None for all of them.
         :raises ValueError: if an id is out of range, a vector not in the task space, or their number wrong.
         """
@@ -105,7 +105,8 @@ class TaskVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]], ABC):
         if tasks is None:
             self._given[chosen] = False
         else:
-            self._give("task" if np.ndim(tasks) > 1 else "task_id", tasks, chosen)
+            values = np.full(len(chosen), tasks) if np.ndim(tasks) == 0 else tasks
+            self._give("task" if np.ndim(values) > 1 else "task_id", values, chosen)
 
     def _give(self, key: str, value: Any, indices: NDArray[np.int64]) -> None:
         if key == "task_id":
@@ -189,9 +190,35 @@ class TaskVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]], ABC):
     @property
     def tasks(self) -> FloatArray:
         """Tasks of the current episodes, shape (num_envs, task_dim), a copy."""
+        self._check_begun()
         return self._tasks.copy()
 
     @property
     def task_ids(self) -> NDArray[np.int64]:
         """Indices of the current episodes' tasks in ``train_tasks``, -1 for a task given as a vector, (num_envs,), a copy."""
+        self._check_begun()
         return self._task_ids.copy()
+
+    def _check_begun(self) -> None:
+        if self._observations is None:
+            raise ResetNeeded("The envs have no tasks before their first reset: call reset() first.")
+
+    @property
+    def task_space(self) -> spaces.Box:
+        """The box that every task lies in."""
+        return self.task_family.task_space
+
+    @property
+    def train_tasks(self) -> FloatArray:
+        """Tasks to meta-train on, shape (n, task_dim), read-only."""
+        return self.task_family.train_tasks
+
+    @property
+    def validation_tasks(self) -> FloatArray:
+        """Tasks to choose hyper-parameters and checkpoints on, shape (n, task_dim), read-only."""
+        return self.task_family.validation_tasks
+
+    @property
+    def test_tasks(self) -> FloatArray:
+        """Tasks to report results on, shape (n, task_dim), read-only."""
+        return self.task_family.test_tasks

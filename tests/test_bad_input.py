@@ -15,7 +15,7 @@ from gymnasium.error import DependencyNotInstalled
 from gymnasium.wrappers import FlattenObservation, FrameStackObservation, RescaleObservation, TransformObservation
 from hypothesis import given
 from hypothesis import strategies as st
-from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecMonitor, VecNormalize
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL, many
 from htr_envs import DynamicsVectorEnv, PointRobotEnv, PointRobotFamily, PointRobotVectorEnv, check_task_env
@@ -213,6 +213,7 @@ CHANGED = [
     (lambda: make_task_vec_env(ENV_ID, 4, env_kwargs={**NEAR, "reward_type": "dense"}), "reward_type is not 'sparse'"),
     (lambda: make_task_vec_env(ENV_ID, 4, env_kwargs={"goal_distance": 0.5}), "another task family: its goal_distance is 0.5"),
     (lambda: VecMonitor(VecNormalize(make_task_vec_env(ENV_ID, 4, env_kwargs=NEAR))), "VecNormalize stands between"),
+    (lambda: wrapped(gym.wrappers.NormalizeReward, **NEAR), "NormalizeReward stands between"),
 ]
 
 
@@ -850,6 +851,7 @@ def test_an_env_that_is_refused_leaves_the_model_as_it_was(tiny_pearl: MakePEARL
     [
         ((np.zeros(3, dtype=np.float32), 0.0), "observations must have the shape of its observation_space"),
         ((np.zeros(2, dtype=np.float32), np.zeros(2)), "an env's reward must be a number"),
+        ((np.zeros(2, dtype=np.float32),), "an env's step must return observation, reward, terminated, truncated and info"),
     ],
 )
 def test_a_robot_that_returns_something_else(returned: Any, message: str, tiny_pearl: MakePEARL) -> None:
@@ -857,6 +859,47 @@ def test_a_robot_that_returns_something_else(returned: Any, message: str, tiny_p
     robot.step = lambda action: (*returned, False, False, {})  # type: ignore[method-assign]
     with pytest.raises(ValueError, match=message):
         tiny_pearl().adapt(robot)
+
+
+def test_what_a_wrapper_complains_of_is_said_as_it_is(tiny_pearl: MakePEARL) -> None:
+    class Careful(VecEnvWrapper):
+        def reset(self) -> Any:
+            return self.venv.reset()
+
+        def step_wait(self) -> Any:
+            raise ValueError("joint 3 is beyond its limit")
+
+    with pytest.raises(ValueError, match=r"^joint 3 is beyond its limit$"):
+        tiny_pearl().adapt(Careful(DummyVecEnv([lambda: Robot(20)])))
+
+
+@pytest.mark.parametrize("normalizer", [gym.wrappers.NormalizeReward, gym.wrappers.NormalizeObservation])
+def test_adaptation_to_what_is_normalized_elsewhere(normalizer: Any, tiny_pearl: MakePEARL) -> None:
+    with pytest.raises(ValueError, match=f"{normalizer.__name__} stands between"):
+        evaluate_adaptation(tiny_pearl(), wrapped(normalizer), n_episodes=1)
+
+
+def test_an_env_that_names_its_task_by_the_index_alone(tiny_pearl: MakePEARL) -> None:
+    """More is not in the contract."""
+
+    class Bare(gym.Env[Any, Any]):
+        max_episode_steps = 20
+
+        def __init__(self) -> None:
+            self.within = gym.make(ENV_ID)
+            self.task_family = PointRobotFamily()
+            self.observation_space, self.action_space = self.within.observation_space, self.within.action_space
+
+        def reset(self, **kwargs: Any) -> Any:
+            return self.within.reset(**kwargs)
+
+        def step(self, action: Any) -> Any:
+            return self.within.step(action)
+
+    env = Bare()
+    env.reset(options={"task_id": 7})
+    assert len(tiny_pearl().adapt(env, n_episodes=2).returns) == 2
+    assert env.reset()[1]["task_id"] == 7
 
 
 @pytest.mark.parametrize("tasks", [[[0.0, 1.0]], np.zeros((0, 2)), np.zeros(3)])

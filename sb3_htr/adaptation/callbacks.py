@@ -79,7 +79,8 @@ class MetaEvalCallback(EvalCallback):
         self.returns = [returns.numpy() for returns in state["returns"]]
         self.successes = [successes.numpy() for successes in state["successes"]]
         self.best_mean_reward = state["best_mean_reward"]
-        for child, numbers in zip(self._children(), state["children"], strict=False):
+        # Older checkpoints have none
+        for child, numbers in zip(self._children(), state.get("children", []), strict=False):
             vars(child).update(numbers)
 
     def _children(self) -> list[BaseCallback]:

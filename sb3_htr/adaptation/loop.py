@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, dummy_vec_env
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_htr.adaptation.adaptation import Step
@@ -103,7 +103,10 @@ def _step(env: VecEnv, actions: np.ndarray) -> VecEnvStepReturn:
         return env.step(actions)
     except ValueError as error:
         # Where SB3 stores what the env returned; within the env, an error is the env's own
-        wrong = NOT_STORED.get(traceback.extract_tb(error.__traceback__)[-1].name)
-        if wrong is None:
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        wrong = NOT_STORED.get(last.name)
+        if last.filename != dummy_vec_env.__file__ or wrong is None:
             raise
+        if "unpack" in str(error):
+            wrong = "an env's step must return observation, reward, terminated, truncated and info"
         raise ValueError(f"{error}: {wrong}") from error

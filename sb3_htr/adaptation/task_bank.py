@@ -160,7 +160,7 @@ class TaskBank:
         :param state: of :meth:`state_dict`
         :raises ValueError: if another version of the package saved it, or a model with another ``context_size``
         """
-        missing = [name for name in ARRAYS if name not in state]
+        missing = [name for name in (*ARRAYS, "new") if name not in state]
         if missing:
             raise ValueError(f"What was saved of the task bank has no {missing[0]}: load it with the version that saved it.")
         _, kept, width = state["episodes"].shape

@@ -17,11 +17,8 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_htr.common.type_aliases import TaskFamily
 
-# Wrappers of single envs that are known to change rewards
-REWARD_WRAPPERS: dict[str, type[gym.Wrapper]] = {
-    "gymnasium's RewardWrapper": gym.RewardWrapper,
-    "gymnasium's NormalizeReward": gym.wrappers.NormalizeReward,
-}
+# Of gymnasium, with statistics of their own
+NORMALIZERS: tuple[type[gym.Wrapper], ...] = (gym.wrappers.NormalizeObservation, gym.wrappers.NormalizeReward)
 # Of gymnasium's TimeLimit, and of an env that counts the steps itself, as a batched one does
 TIME_LIMITS = ("_max_episode_steps", "max_episode_steps")
 TASK_ENV_ADVICE = (
@@ -239,28 +236,30 @@ def check_rewards(env: VecEnv) -> None:
     :param env: env to train on
     :raises ValueError: if something stands between its rewards and the replay buffer, or they are the dense proxy
     """
-    changed_by = next((name for name, kind in REWARD_WRAPPERS.items() if any(env.env_is_wrapped(kind))), None)
-    if changed_by is not None:
+    check_is_not_normalized(env)
+    if any(env.env_is_wrapped(gym.RewardWrapper)):
         raise ValueError(
-            f"The env is in {changed_by}, which changes its rewards, but relabelled rewards are those of its task family: "
-            "leave the wrapper out."
+            "The env is in gymnasium's RewardWrapper, which changes its rewards, but relabelled rewards are those of its task "
+            "family: leave the wrapper out."
         )
     if env.has_attr("reward_type") and env.get_attr("reward_type")[0] != "sparse":
         raise ValueError(
             "The env's reward_type is not 'sparse', but context and relabelled rewards are: make the env with "
             "reward_type='sparse', and for the dense baseline pass replay_buffer_kwargs={'rl_reward_type': 'dense'}."
         )
-    check_is_not_normalized(env)
 
 
 def check_is_not_normalized(env: VecEnv) -> None:
     """
     :param env: env to train on, or to adapt to
-    :raises ValueError: if it is in SB3's VecNormalize
+    :raises ValueError: if it is in SB3's VecNormalize, or in gymnasium's wrappers of that kind
     """
+    name = next((kind.__name__ for kind in NORMALIZERS if any(env.env_is_wrapped(kind))), None)
     if unwrap_vec_normalize(env) is not None:
+        name = "VecNormalize"
+    if name is not None:
         raise ValueError(
-            "VecNormalize stands between the env and relabelled rewards, and is not saved with the model: leave it out, the "
+            f"{name} stands between the env and relabelled rewards, and is not saved with the model: leave it out, the "
             "policy normalizes observations itself. Rewards cannot be normalized: all tasks share one scale."
         )
 

@@ -71,6 +71,7 @@ class BatchedTaskVecEnv(VecEnv):
         for i in np.flatnonzero(dones):
             infos[i]["terminal_observation"] = final_obs[i]
             infos[i]["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
+            self.reset_infos[i] = {"task_id": int(self.vector_env.task_ids[i])}  # type: ignore[attr-defined]
         # An env may write into the same array at each step, and this one is kept
         return obs.copy(), rewards, dones, infos
 

@@ -468,7 +468,8 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         :return: chooses z and takes in what happens
         :raises ValueError: if the explorer goes by successes, and the model was trained on a family without
         """
-        chosen = self.explorer if explorer in (None, self.explorer.name) else to_explorer(explorer)
+        own = to_explorer(self.explorer)
+        chosen = own if explorer in (None, own.name) else to_explorer(explorer)
         self._check_explorer(chosen)
         check_numbers(n_envs=(n_envs, 1))
         return Adaptation(
@@ -517,7 +518,9 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
             checks.get_max_episode_steps(vec_env)
             if task is None:
                 vec_env.reset()
-                task = np.array(vec_env.get_attr("task")[0])
+                # Of an env that names its task by the index alone, that
+                has_vector = vec_env.has_attr("task")
+                task = np.array(vec_env.get_attr("task")[0] if has_vector else vec_env.unwrapped.reset_infos[0]["task_id"])
             if np.ndim(task) == 0 and not np.issubdtype(np.asarray(task).dtype, np.integer):
                 raise ValueError(f"task is {task!r}: pass the index of a training task, or a task as a vector, [{task!r}].")
             vec_env.set_options({"task_id": int(task)} if np.ndim(task) == 0 else {"task": np.asarray(task, dtype=np.float32)})

@@ -71,6 +71,25 @@ def test_the_posterior_of_prior_is_over_all_episodes(tiny_pearl: MakePEARL) -> N
     np.testing.assert_allclose(deviation, expected[1].sqrt(), rtol=1e-4)
 
 
+def test_what_exploration_alone_found_is_in_the_final_z(tiny_pearl: MakePEARL) -> None:
+    """Also where there are fewer episodes than it explores in."""
+    model = tiny_pearl()
+    adaptation = begin(model, "prior")
+    np.testing.assert_array_equal(adaptation.explorer.final_z(), adaptation.explorer.z, "nothing was tried yet")
+    play(adaptation, [[1.0], [0.0], [2.0]])
+    drawn = np.stack([adaptation.explorer.final_z()[0] for _ in range(200)])
+    mean, deviation = adaptation.posterior()
+    np.testing.assert_allclose(drawn.mean(axis=0), mean[0], atol=0.3 * deviation.max())
+    np.testing.assert_allclose(drawn.std(axis=0), deviation[0], rtol=0.3)
+
+    know_tasks(model, 6)
+    adaptation = begin(model, "learned-prior", n_envs=200)
+    _, rewards = walk(adaptation, np.full(200, 2.0), n_episodes=3)
+    found = (rewards > 0).any(axis=(1, 2))
+    assert adaptation.explorer.exploring().all() and (adaptation.explorer.z[found, 0] == 2).mean() < 0.5
+    assert (adaptation.explorer.final_z()[found, 0] == 2).mean() > 0.9
+
+
 # --- aggregate
 
 

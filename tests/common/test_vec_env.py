@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from helpers import ENV_ID
@@ -44,6 +45,21 @@ def test_a_batch_has_the_attributes_of_single_envs() -> None:
     assert env.has_attr("task") and len(env.get_attr("task")) == 2
     with pytest.raises(ValueError, match="One call serves the whole batch of envs, not some of them: leave indices out"):
         env.env_method("set_task", None, indices=[0])
+
+
+def test_a_batch_is_as_single_envs_are_one_by_one() -> None:
+    batch, single = (make_task_vec_env(ENV_ID, 2, vec_env_class=kind) for kind in (None, DummyVecEnv))
+    for env in (batch, single):
+        with pytest.raises(ResetNeeded):
+            env.get_attr("task")
+        env.env_method("set_task", 7)
+        env.reset()
+        env.env_method("set_task", None)
+        for _ in range(20):
+            *_, dones, _ = env.step(np.zeros((2, 2), dtype=np.float32))
+        assert dones.all() and [info["task_id"] for info in env.unwrapped.reset_infos] == env.get_attr("task_id")
+    for name in ("train_tasks", "validation_tasks", "test_tasks", "task_space"):
+        np.testing.assert_equal(batch.get_attr(name), single.get_attr(name))
 
 
 def test_ctrl_c_leaves_envs_in_processes_to_the_training() -> None:

@@ -10,7 +10,8 @@ from gymnasium.wrappers import TimeLimit
 
 from helpers.broken_envs import BROKEN, LineEnv, LineFamily, NoDenseReward, column
 from helpers.carts import CartEnv
-from htr_envs import PointRobotEnv, check_task_env
+from htr_envs import DynamicsVectorEnv, PointRobotEnv, PointRobotFamily, PointRobotVectorEnv, check_task_env
+from htr_envs.point_robot import PointRobotDynamics
 
 # Annotations here are wide on purpose: most of these classes break the types that they should have.
 
@@ -87,6 +88,51 @@ def test_spaces_of_float64_are_fine() -> None:
 
 def test_an_env_whose_tasks_change_anything() -> None:
     check_task_env(TimeLimit(CartEnv(), 10))
+
+
+class OtherTasks(LineFamily):
+    """Of each env."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.train_tasks = np.random.uniform(2.1, 3.0, (4, 1)).astype(np.float32)
+        self._freeze()
+
+
+class Backwards(PointRobotDynamics):
+    def step(self, actions: Any) -> Any:
+        return super().step(-actions)
+
+
+BATCHES: dict[str, tuple[Any, str]] = {
+    "of its own": (PointRobotVectorEnv, ""),
+    "backwards": (
+        lambda num_envs, max_episode_steps: DynamicsVectorEnv(PointRobotFamily(), Backwards(num_envs), max_episode_steps),
+        "The batch of the id gives another episode than the env itself",
+    ),
+    "with other tasks": (lambda **kwargs: PointRobotVectorEnv(**kwargs, task_seed=1), "Another env of the same id has other"),
+    "that cannot be made": (
+        lambda num_envs: None,
+        'The batch of the id cannot be made. It raised TypeError("<lambda>() got an unexpected',
+    ),
+}
+
+
+@pytest.mark.parametrize(("batch", "sentence"), BATCHES.values(), ids=BATCHES)
+def test_the_batch_of_an_id_is_another_of_the_same_envs(batch: Any, sentence: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gym.registry["SparsePointRobot-v0"], "vector_entry_point", batch)
+    env = gym.make("SparsePointRobot-v0", render_mode="rgb_array")
+    if sentence:
+        assert_refused(env, sentence)
+    else:
+        check_task_env(env)
+
+
+def test_an_id_whose_envs_have_other_tasks_each_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    entry_point: Any = lambda: LineEnv(OtherTasks())  # noqa: E731
+    spec = gym.envs.registration.EnvSpec("Other-v0", entry_point, max_episode_steps=10)
+    monkeypatch.setitem(gym.registry, "Other-v0", spec)
+    assert_refused(gym.make("Other-v0"), "Another env of the same id has other train_tasks")
 
 
 class TellsItsTask(CartEnv):

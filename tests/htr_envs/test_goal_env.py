@@ -128,6 +128,22 @@ class ListEnv(ReachEnv):
         return self._observe(), {}
 
 
+class CutEnv(ReachEnv):
+    """It cuts an episode short, and then wants a reset."""
+
+    over = True
+
+    def reset(self, **kwargs: Any) -> Any:
+        self.over = False
+        return super().reset(**kwargs)
+
+    def step(self, action: Any) -> Any:
+        assert not self.over, "reset first"
+        *others, terminated, _, info = super().step(action)
+        self.over = bool(abs(self.position[0]) > 1.2)
+        return *others, terminated, self.over, info
+
+
 class PlainEnv(ReachEnv):
     """Not a GoalEnv."""
 
@@ -145,7 +161,7 @@ class DiscreteEnv(ReachEnv):
 
 
 _class: Any
-for _class in (ReachEnv, ChoiceEnv, CostlyEnv, InformedEnv, UnseededEnv, ListEnv, PlainEnv, DiscreteEnv):
+for _class in (ReachEnv, ChoiceEnv, CostlyEnv, InformedEnv, UnseededEnv, ListEnv, CutEnv, PlainEnv, DiscreteEnv):
     gym.register(f"Toy{_class.__name__}-v0", entry_point=_class, max_episode_steps=30)
 TOY, CHOICE = "ToyReachEnv-v0", "ToyChoiceEnv-v0"
 
@@ -258,6 +274,16 @@ def test_an_end_at_the_envs_own_goal_is_none_and_any_other_is_one() -> None:
     assert np.allclose(position, own_goal, atol=0.01) and not any(ends)
     ends = [env.step(np.array([1.0, 0.0], dtype=np.float32))[2] for _ in range(30)]
     assert not ends[0] and ends[-1]
+
+
+def test_an_episode_that_the_goal_env_cuts_short_is_truncated() -> None:
+    env = gym.make(hide_goal("ToyCutEnv-v0"))
+    check_task_env(env)
+    env.reset(seed=0)
+    ends = [env.step(np.array([1.0, 0.0], dtype=np.float32))[2:4]]
+    while not any(ends[-1]):
+        ends.append(env.step(np.array([1.0, 0.0], dtype=np.float32))[2:4])
+    assert len(ends) < 30 and ends[-1] == (False, True)
 
 
 def test_task_sets_follow_the_task_seed_alone() -> None:

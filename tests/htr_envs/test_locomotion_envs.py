@@ -55,6 +55,22 @@ def test_a_batch_of_one_is_the_single_env_over_several_episodes(env_id: str) -> 
     assert n_episodes >= 2
 
 
+def test_a_fork_steps_with_threads_of_its_own() -> None:
+    code = f"""
+import os, gymnasium, htr_envs
+env = gymnasium.make_vec({ANT!r}, 4, n_threads=2)
+env.reset(seed=0)
+actions = env.action_space.sample()
+env.step(actions)
+child = os.fork()
+states = env.step(actions)[0].tobytes()
+if child == 0:
+    os._exit(0 if len(states) else 1)
+assert os.waitpid(child, 0)[1] == 0
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
 @both_envs
 def test_the_number_of_threads_changes_nothing(env_id: str) -> None:
     episodes = []

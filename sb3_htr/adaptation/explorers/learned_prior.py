@@ -41,6 +41,11 @@ class LearnedPrior(FixedExploration, ParticleExplorer):
 
     def draw(self, envs: np.ndarray) -> None:
         exploring = th.as_tensor(self.exploring()[envs], device=self._prior.device)[:, None]
-        weights = th.where(exploring, self._prior.softmax(dim=0), self.weights(envs))
+        self.z[envs] = self._drawn(th.where(exploring, self._prior.softmax(dim=0), self.weights(envs)))
+
+    def inferred(self, envs: np.ndarray) -> np.ndarray:
+        return self._drawn(self.weights(envs))
+
+    def _drawn(self, weights: th.Tensor) -> np.ndarray:
         particle = th.multinomial(weights.cpu(), 1, generator=self.adaptation.generator)[:, 0]
-        self.z[envs] = self.particles.z.cpu()[particle].numpy()
+        return self.particles.z.cpu()[particle].numpy()

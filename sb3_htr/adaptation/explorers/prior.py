@@ -37,12 +37,30 @@ class FixedExploration(Explorer):
             self.adaptation.infer(ended, keep=True)
             self.draw(ended)
 
+    def final_z(self) -> np.ndarray:
+        """
+        :return: (n_envs, latent_dim), the z to act with when no more episodes follow. Where all of them explored, a draw from
+            the posterior over them, as z is still one that nothing was learnt for
+        """
+        z = super().final_z()
+        explored = np.flatnonzero(self.exploring() & (self.adaptation.n_episodes > 0))
+        if len(explored):
+            z[explored] = self.inferred(explored)
+        return z
+
     @abstractmethod
     def draw(self, envs: np.ndarray) -> None:
         """
         Choose z for the next episode.
 
         :param envs: (k,) int, whose episodes have ended, and are in their posteriors
+        """
+
+    @abstractmethod
+    def inferred(self, envs: np.ndarray) -> np.ndarray:
+        """
+        :param envs: (k,) int
+        :return: (k, latent_dim), z drawn from the posterior over their episodes so far
         """
 
 
@@ -63,5 +81,8 @@ class Prior(FixedExploration):
         return np.where(self.exploring()[:, None], 1.0, super().deviation())
 
     def draw(self, envs: np.ndarray) -> None:
-        explored, inferred = self.adaptation.noise(len(envs)), self.adaptation.sample_posterior(envs)
+        explored, inferred = self.adaptation.noise(len(envs)), self.inferred(envs)
         self.z[envs] = np.where(self.exploring()[envs, None], explored, inferred)
+
+    def inferred(self, envs: np.ndarray) -> np.ndarray:
+        return self.adaptation.sample_posterior(envs)
