@@ -31,6 +31,10 @@ class Evaluation(NamedTuple):
         return " ".join([self.explorer, *(f"{key}={value}" for key, value in self.tested_on.items())])
 
 
+# As Python writes it, and cannot read it
+INFINITY = re.compile(r"(?<![\w'])inf\b(?!')")
+
+
 @dataclass(frozen=True, eq=False)
 class Cell:
     """
@@ -111,8 +115,10 @@ class Cell:
         :param folder: log folder
         :return: arguments of ``sb3-htr train``
         """
-        settings = [f"{key}:{value!r}" for key, value in self.settings.items()]
-        kwargs = [f"{key}:{value!r}" for key, value in self.env_kwargs.items()]
+        settings, kwargs = (
+            [f"{key}:{INFINITY.sub('1e999', repr(value))}" for key, value in given.items()]
+            for given in (self.settings, self.env_kwargs)
+        )
         return [
             *("--env", self.env_id, "--method", self.method),
             *("-f", str(folder), "--verbose", "0", "-n", str(self.n_timesteps)),

@@ -30,6 +30,9 @@ from sb3_htr.zoo.run.trust import import_packages
 # Means over the training of what HTR paper, B.2 reasons with
 LOGGED = ("relabelled_fraction", "rl_reward_mean", "rl_zero_reward_fraction")
 
+# Asked when the code is imported: it may be another one by the time that a training has ended
+CODE = named(commit())
+
 
 def lock_of(cell: Cell, runs: Path) -> SystemLock:
     """
@@ -109,9 +112,9 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
         "elapsed_s": seconds_at(run / "progress.csv", evaluations["timesteps"]),
         "cell": cell.facts(),
         "hyperparams": json.dumps(record["hyperparams"], sort_keys=True),
-        # Of the code as it was when the training began, and as it is now
+        # Of the code as it was when the training began, and as it is in this process
         "commit": named(record),
-        "evaluation_commit": named(commit()),
+        "evaluation_commit": CODE,
         "machine": machine(),
         **evaluate(cell, model, record["hyperparams"].get("explorer")),
     }

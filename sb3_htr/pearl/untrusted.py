@@ -120,15 +120,19 @@ def _schedule(learning_rate: Any) -> dict[str, LinearSchedule]:
 
 
 def _policy_kwargs(given: dict[str, Any]) -> dict[str, Any]:
-    known = {"latent_dim", "net_arch", "encoder_arch", "normalize_observations"}
+    known = {"latent_dim", "net_arch", "encoder_arch", "n_critics", "normalize_observations"}
     if given.get("encoder_class") in list(ENCODERS):
         known.add("encoder_class")
-    unknown = [name for name in given if name not in known and not name.startswith(":")]  # SB3 marks some
+    # SB3 marks some with a colon; and what says how weights are learnt says nothing of those in a file
+    unknown = [name for name in given if name not in (*known, "optimizer_kwargs") and not name.startswith(":")]
     if unknown:
         raise Refused(
             f"its policy has the setting {unknown[0]!r}, which only PEARL.load restores, and that may run code of the file."
         )
     kwargs = {name: value for name, value in given.items() if name in known and value is not None}
+    n_critics = kwargs.get("n_critics", 2)
+    if type(n_critics) is not int or not 1 <= n_critics <= MAX_LAYERS:
+        raise Refused(f"PEARL does not have {n_critics} critics here: expected from 1 to {MAX_LAYERS}.")
     for units in (kwargs.get("net_arch", []), kwargs.get("encoder_arch", []), [kwargs.get("latent_dim", 1)]):
         if len(units) > MAX_LAYERS or not all(type(unit) is int and 1 <= unit <= MAX_UNITS for unit in units):
             raise Refused(f"PEARL's networks do not have layers of {units} units.")

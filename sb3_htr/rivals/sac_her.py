@@ -125,6 +125,7 @@ class SACHER(Rival, SAC):
     :param env: env of a task family, VecEnv of such envs, or registered id
     :param gradient_steps: updates after each rollout, -1 for as many as it had env steps
     :param replay_buffer_kwargs: arguments of SB3's ``HerReplayBuffer``
+    :param policy_kwargs: arguments of the policy
     :param seed: seed of all random generators
     :param kwargs: arguments of ``SAC`` but ``train_freq`` and ``replay_buffer_class``
     :raises ValueError: for an env without tasks or time limit, or with rewards that are not those of its tasks
@@ -140,6 +141,7 @@ class SACHER(Rival, SAC):
         env: GymEnv | str | None,
         gradient_steps: int = -1,
         replay_buffer_kwargs: dict[str, Any] | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
         seed: int | None = None,
         **kwargs: Any,
     ) -> None:
@@ -154,6 +156,8 @@ class SACHER(Rival, SAC):
             env=env,  # type: ignore[arg-type]
             gradient_steps=gradient_steps,
             replay_buffer_kwargs=replay_buffer_kwargs,
+            # SB3 adds to it, and what was given is the caller's, and in records
+            policy_kwargs=dict(policy_kwargs or {}),
             seed=seed,
             **kwargs,
         )

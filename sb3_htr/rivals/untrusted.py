@@ -16,6 +16,8 @@ MAX_LAYERS, MAX_UNITS = 4, 1024
 # What a file may say of networks, with the largest number for each
 NETWORKS = {"net_arch": MAX_UNITS, "lstm_hidden_size": MAX_UNITS, "n_lstm_layers": MAX_LAYERS}
 NETWORKS |= dict.fromkeys(("shared_lstm", "enable_critic_lstm", "use_sde"), 1)
+# What says how weights begin and how they are learnt, and nothing of those in a file
+OF_TRAINING = ("log_std_init", "ortho_init", "optimizer_kwargs")
 # The largest number of what else it may say
 MAX_COUNT = 10_000
 
@@ -38,7 +40,8 @@ def load_untrusted(
         data, weights = read_model(path, ["policy"])
         n_steps = data["num_timesteps"]
         # A copy, because SB3 adds to it
-        policy_kwargs = copy.deepcopy(hyperparams.get("policy_kwargs", {}))
+        given = copy.deepcopy(hyperparams.get("policy_kwargs", {}))
+        policy_kwargs = {name: value for name, value in given.items() if name not in OF_TRAINING}
         counts = {name: hyperparams[name] for name in model_class.ACTS_BY if name in hyperparams}
         if type(n_steps) is not int or not all(_is_plain(count, MAX_COUNT) for count in counts.values()):
             raise ValueError(f"it has {n_steps} env steps and the settings {counts}")
@@ -48,7 +51,7 @@ def load_untrusted(
                 raise ValueError(
                     f"its policy has {name}: {value}, which only --trust restores, and that may run code of the file"
                 )
-        settings = {**counts, **model_class.ACTS_WITH}
+        settings = {**counts, **model_class.ACTS_WITH, "use_sde": hyperparams.get("use_sde") is True}
         model = model_class(model_class.DEFAULT_POLICY, env, device=device, policy_kwargs=policy_kwargs, **settings)
         model.policy.load_state_dict(weights["policy"])
     except Exception as error:  # whatever a stranger can put into a file

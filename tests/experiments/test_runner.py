@@ -1,6 +1,7 @@
 """Cells of an experiment are runs of the command line."""
 
 import json
+import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -188,6 +189,42 @@ def test_explorers_and_episodes_are_those_of_the_experiment(tmp_path: Path) -> N
     assert (as_today != by_itself).any()
 
 
+def test_plain_settings_of_a_variant_reach_its_evaluation(tmp_path: Path) -> None:
+    """Its models are loaded as those of strangers are."""
+    kwargs = {"n_test_tasks": 4}
+    networks = {"net_arch": [8], "encoder_arch": [8], "n_critics": 3, "optimizer_kwargs": {"eps": 1e-5}}
+    trial: dict[str, Any] = {"n_envs": 4, "n_episodes_per_trial": 2, "n_epochs": 1, "use_sde": True}
+    trial["policy_kwargs"] = {"lstm_hidden_size": 4, "net_arch": [4], "log_std_init": -0.5}
+    of_sac = {"n_envs": 4, "gradient_steps": 1, "use_sde": True, "policy_kwargs": {"net_arch": [4]}}
+    variants = (
+        Variant("htr-ser", "critics", {**SMALL, "policy_kwargs": networks}, kwargs),
+        Variant("rl2", "sde", trial, kwargs),
+        Variant("sac-her", "told", of_sac, kwargs),
+    )
+    for cell in Experiment("settings", "", ENV_ID, 960, variants, 1, 960, by(("prior",))).cells():
+        assert run_cell(cell, tmp_path)
+        agent = agent_at(cell.run_folder(tmp_path), "last")
+        both = [replace(agent, trusted=trust).load() for trust in (False, True)]
+        ours, theirs = (evaluate_adaptation(model, ENV_ID, n_episodes=1) for model in both)
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_the_code_that_evaluated_is_that_of_the_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever was committed since it began."""
+    (cell,) = Experiment("one", "", ENV_ID, 480, (Variant("htr-ser", "", SMALL, {"n_test_tasks": 4}),), 1, 480).cells()
+    monkeypatch.setattr("sb3_htr.common.versions.commit", lambda: {"commit": "later", "dirty": False})
+    monkeypatch.setattr("sb3_htr.experiments.runner.commit", lambda: {"commit": "later", "dirty": False}, raising=False)
+    assert run_cell(cell, tmp_path)
+    assert "later" not in str(np.load(cell.result(tmp_path))["evaluation_commit"])
+
+
+def test_infinity_can_be_a_setting() -> None:
+    settings = {"replay_buffer_kwargs": {"relabeller": {"temperature": math.inf}}}
+    (cell,) = Experiment("one", "", ENV_ID, 480, (Variant("htr-hfr", "random", settings),), 1).cells()
+    (given,) = [word for word in cell.training(Path("x")) if word.startswith("replay_buffer_kwargs:")]
+    assert eval(given.partition(":")[2], {}) == settings["replay_buffer_kwargs"]
+
+
 def test_one_cell_of_a_job_array_writes_no_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(grid.EXPERIMENTS, "pair", Experiment("pair", "", ENV_ID, 480, (Variant("htr-ser"),), 2))
     ran: list[tuple[str, Path]] = []
@@ -223,8 +260,9 @@ def test_results_of_what_is_finished_are_written_without_training(
     assert "1 of 2 runs are finished." in capsys.readouterr().out
     summary = json.loads(Path("results", "pair", "summary.json").read_text())
     assert {row["n_seeds"] for row in summary["rows"]} == {1} and summary["command"] == "sb3-htr experiment pair --seeds 2"
-    with pytest.raises(SystemExit):
-        main(["experiment", "pair", "--finished", "--cell", "1"])
+    for wrong in (["--cell", "1"], ["--seed", "7"]):
+        with pytest.raises(SystemExit):
+            main(["experiment", "pair", "--finished", *wrong])
 
 
 def test_runs_in_an_object_store_are_refused() -> None:

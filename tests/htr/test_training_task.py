@@ -198,11 +198,17 @@ def test_returns_of_several_steps_are_of_steps_that_followed_each_other(kind: di
     assert set(steps) == ({1, 2, 3} if kind["level"] == "episode" else {1})
 
 
-def test_a_task_without_hindsight_lends_its_row() -> None:
-    buffer = relabelling(KINDS[1], n_episodes=1)
-    data = buffer.sample(4, meta_batch_size=64)
-    assert data.relabelled.all() and buffer.stats()["replay/n_hindsight_buffers"] <= 2
-    assert np.isfinite(data.rewards.numpy()).all()
+def test_rows_are_drawn_from_all_that_was_relabelled_and_from_nothing_else() -> None:
+    """Also to tasks that were not played yet."""
+    buffer = relabelling(KINDS[1], n_episodes=5)
+    buffer.sample(4, meta_batch_size=4)
+    relabeller = buffer.relabeller
+    assert isinstance(relabeller, TrainingTaskRelabelling)
+    known = relabeller.episodes.index().tasks
+    assert set(known) - set(buffer.episodes.index().tasks), "some of them were not played"
+    tasks = relabeller.draw(buffer.episodes.index().tasks.repeat(200)).tasks
+    _, counts = np.unique(tasks, axis=0, return_counts=True)
+    assert len(counts) == len(known) and counts.min() > 0.5 * counts.max()
 
 
 # --- as a part of training

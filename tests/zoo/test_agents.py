@@ -155,6 +155,28 @@ def test_export_is_small_exact_and_plain(run: Path, tmp_path: Path, tiny_pearl: 
     exported.learn(500)
 
 
+def test_what_is_told_of_an_agent_is_of_its_training_wherever_it_is_evaluated(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    easy, few = ["--env-kwargs", "goal_radius:0.6"], ["--n-episodes", "1"]
+    scores = []
+    for more in ([], easy):
+        assert main(["evaluate", str(run), *few, *more, *["--stochastic"] * bool(more)]) == 0
+        with np.load(run / "adaptation.npz") as raw:
+            scores.append(raw["returns"].mean())
+            assert json.loads(str(raw["env_kwargs"])) == ({"goal_radius": 0.6} if more else {})
+            assert raw["deterministic"] == (not more)
+    assert scores[0] != scores[1]
+    with pytest.raises(ValueError, match="--env-kwargs would make a card of another env than that of the training"):
+        main(["export", str(run), "-o", str(tmp_path / "agent"), *few, *easy])
+    other = run_folder(run.parents[1], number=2)
+    shutil.copytree(run, other)
+    record = {**json.loads((other / RECORD).read_text()), "env_kwargs": {"goal_radius": 0.6}}
+    (other / RECORD).write_text(json.dumps(record))
+    with pytest.raises(ValueError, match=r"differ in \['env_kwargs'\]"):
+        main(["plot", str(run.parent), "--only", "learning", "-o", str(tmp_path), *easy])
+
+
 @pytest.mark.parametrize(
     ("setting", "name"),
     [

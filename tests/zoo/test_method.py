@@ -277,6 +277,18 @@ def test_keywords_may_be_python_where_the_file_is_trusted(tmp_path: Path) -> Non
     assert PEARL.load(run_folder(tmp_path) / f"{ENV_ID}.zip").policy_kwargs["net_arch"] == [16]
 
 
+@pytest.mark.parametrize("file", ["pearl.yml", "pearl_paper.yml"])
+@pytest.mark.parametrize("name", ["htr-hfr", "htr-hipi"])
+def test_the_temperature_of_rivals_is_the_entropy_coefficient(name: str, file: str) -> None:
+    """That is what it stands for: their papers scale rewards instead."""
+    default = {"ent_coef": 0.01}
+    for env_id, block in yaml.safe_load(hyperparams_file(file).read_text()).items():
+        settings = get_method(name).settings({**default, **block})
+        temperature = settings["replay_buffer_kwargs"]["relabeller"].get("temperature", 0.01)
+        assert temperature == settings["ent_coef"], env_id
+    assert "temperature" not in str(get_method("htr-ser").settings(block))
+
+
 def test_no_method_replaces_another(monkeypatch: pytest.MonkeyPatch) -> None:
     known = dict(methods())
     monkeypatch.setattr("sb3_htr.zoo.run.method.methods", lambda: known)

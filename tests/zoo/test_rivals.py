@@ -76,6 +76,7 @@ def test_what_is_exported_acts_the_same_and_says_how_to_use_it(
     np.testing.assert_array_equal(ours, theirs)
     card = (file.parent / "README.md").read_text()
     assert methods()[method].about in card and ALGORITHMS[method].about in card and "prior" not in card
+    assert "hindsight-task-relabelling" not in card
     assert f"--method {method}" in card and yaml.safe_load(card.split("---")[1])["model-index"][0]["name"] == method
     monkeypatch.chdir(file.parent)
     exec(re.findall(r"```python\n(.*?)```", card, re.DOTALL)[0], {})

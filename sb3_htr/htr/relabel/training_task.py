@@ -23,8 +23,8 @@ class TrainingTaskRelabelling(HindsightBuffers):
     in together. Without Z, an easy task would get everything.
 
     Relabelling is eager, as in HFR's code: once, when the first meta-batch after a rollout is drawn, with the networks as they
-    are then. A relabelled row of a meta-batch is drawn as PEARL draws it, from the hindsight buffer of its task; a task whose
-    hindsight buffer is empty lends its row to one that has something. Hindsight buffers take as much memory as the replay.
+    are then. A relabelled row of a meta-batch is drawn as PEARL draws it, from any hindsight buffer that holds something, with
+    equal chances. Hindsight buffers take as much memory as the replay.
 
     :param temperature: what utilities are divided by. Both papers scale rewards instead, at entropy coefficient 1: this is the
         entropy coefficient that goes with unscaled rewards. 0.01, the default, is the reward scale 100 of PEARL's and HFR's
@@ -57,10 +57,9 @@ class TrainingTaskRelabelling(HindsightBuffers):
 
     def draw(self, tasks: np.ndarray) -> HindsightDraw:
         self._take_in()
-        buffer, index = self.buffer, self.episodes.index()
-        is_empty = np.diff(index.task_episode)[tasks] == 0
-        borrowed = index.tasks[buffer.relabel_rng.integers(len(index.tasks), size=len(tasks))]
-        chosen = np.where(is_empty, borrowed, tasks)
+        buffer, known = self.buffer, self.episodes.index().tasks
+        # Whether they were played or not: what was relabelled first would wait until they are
+        chosen = known[buffer.relabel_rng.integers(len(known), size=len(tasks))]
         return self.draw_from(chosen, buffer.task_family.train_tasks[chosen])
 
     def _take_in(self) -> None:

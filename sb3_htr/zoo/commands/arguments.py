@@ -51,6 +51,7 @@ def make_parser(
         epilog=f"examples:\n{example}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         parents=parents,
+        allow_abbrev=False,
     )
 
 
@@ -127,8 +128,7 @@ def chosen_agent(parser: argparse.ArgumentParser, args: argparse.Namespace, path
         check_env_kwargs(agent.record["env_kwargs"], agent.path, args.gym_packages)
     import_packages(args.gym_packages, agent.record["gym_packages"], agent.path, args.trust)
     find_hidden(agent.env_id)
-    kwargs = {**agent.record["env_kwargs"], **args.env_kwargs}
-    return dataclasses.replace(agent, record={**agent.record, "env_kwargs": kwargs}, trusted=args.trust)
+    return dataclasses.replace(agent, other_env_kwargs=args.env_kwargs, trusted=args.trust)
 
 
 def parse(parser: argparse.ArgumentParser, argv: Sequence[str]) -> tuple[argparse.Namespace, TrainedAgent]:

@@ -1,5 +1,6 @@
 """``sb3-htr evaluate``: adapt a trained agent to tasks that it has not seen."""
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -54,9 +55,13 @@ def main(argv: Sequence[str]) -> None:
         print(f"{agent.path}: adapting to {len(tasks)} {args.tasks} tasks of {agent.env_id}, explorer {explorer!r}")
         print(table(record))
         about = {"model": str(agent.path), "env_id": agent.env_id, "explorer": explorer, "set": args.tasks, "seed": args.seed}
+        about |= {"env_kwargs": json.dumps(agent.env_kwargs, default=str), "deterministic": not args.stochastic}
         np.savez_compressed(path, tasks=tasks, **record._asdict(), **about)
     pictures = [output / "adaptation_curve.png"]
-    title = f"{agent.env_id}, {len(tasks)} {args.tasks} tasks, explorer {explorer}"
+    title = (
+        f"{agent.env_id}, {len(tasks)} {args.tasks} tasks, explorer {explorer}{', sampled actions' if args.stochastic else ''}"
+    )
+    title += "".join(f", {name} {value}" for name, value in agent.other_env_kwargs.items())
     plot_adaptation_curve(record, pictures[0], title)
     if record.achieved.shape[-1] == 2:
         pictures.append(output / "adaptation_paths.png")

@@ -95,6 +95,13 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--push-to-hub", metavar="USER[/NAME]", help="upload; log in with `hf auth login` first")
     parser.add_argument("--private", action="store_true", help="with --push-to-hub: a private repository")
     args, agent = parse(parser, argv)
+    if "hyperparams" not in agent.record:  # a model file of one's own, whose env is what is given
+        agent = dataclasses.replace(agent, record={**agent.record, "env_kwargs": agent.env_kwargs})
+    elif args.env_kwargs:
+        raise ValueError(
+            "--env-kwargs would make a card of another env than that of the training: leave it out, and see with "
+            "`sb3-htr evaluate` what the agent does there."
+        )
     output = args.output or Path("exported") / agent.stem
     alone = output.suffix == ".zip"
     if alone and (args.push_to_hub or args.film):

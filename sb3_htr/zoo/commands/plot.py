@@ -115,7 +115,7 @@ def groups_of(parser: argparse.ArgumentParser, args: argparse.Namespace) -> dict
     envs = {agent.env_id for agents in groups.values() for agent in agents}
     if len(envs) > 1:
         raise ValueError(f"These runs are of several envs, {', '.join(sorted(envs))}: plot one env at a time.")
-    of_each = {label: agents[0].record["env_kwargs"] for label, agents in groups.items()}
+    of_each = {label: agents[0].env_kwargs for label, agents in groups.items()}
     if any(kwargs != next(iter(of_each.values())) for kwargs in of_each.values()):
         print(f"The envs of these curves have different arguments, {of_each}: their tasks are not the same.", file=sys.stderr)
     return groups

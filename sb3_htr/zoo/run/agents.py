@@ -8,7 +8,7 @@ import shlex
 import sys
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
@@ -45,12 +45,19 @@ class TrainedAgent:
     :param record: of its training: ``env_id``, ``method``, ``env_kwargs``, ``gym_packages``
     :param folder: run folder, None for a model file of its own
     :param trusted: whether its files may have code run, which networks, explorers and wrappers of one's own need
+    :param other_env_kwargs: arguments of the env that are to be others than in its training
     """
 
     path: Path
     record: dict[str, Any]
     folder: Path | None
     trusted: bool = False
+    other_env_kwargs: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def env_kwargs(self) -> dict[str, Any]:
+        """Arguments of the env that it acts in."""
+        return {**self.record["env_kwargs"], **self.other_env_kwargs}
 
     @property
     def env_id(self) -> str:
@@ -103,7 +110,7 @@ class TrainedAgent:
         drawn: dict[str, Any] = {} if render_mode is None else {"render_mode": render_mode}
         wrap = self._wrapper(ENV_WRAPPER) or (lambda env: env)
         try:
-            return wrap(gym.make(self.env_id, **self.record["env_kwargs"], **drawn))
+            return wrap(gym.make(self.env_id, **self.env_kwargs, **drawn))
         except TypeError as error:
             if not drawn or "'render_mode'" not in str(error):
                 raise
@@ -117,7 +124,7 @@ class TrainedAgent:
         :return: the envs, in the wrappers that they had in training
         """
         wrapper = self._wrapper(ENV_WRAPPER)
-        return self.around(make_task_vec_env(self.env_id, n_envs, env_kwargs=self.record["env_kwargs"], wrapper=wrapper))
+        return self.around(make_task_vec_env(self.env_id, n_envs, env_kwargs=self.env_kwargs, wrapper=wrapper))
 
     def around(self, env: VecEnv) -> VecEnv:
         """

@@ -9,7 +9,7 @@ import yaml
 
 from sb3_htr.adaptation.explorers import EXPLORERS
 from sb3_htr.common.settings import check_numbers, keywords_of
-from sb3_htr.htr.relabel import RELABELLERS
+from sb3_htr.htr.relabel import RELABELLERS, TrainingTaskRelabelling
 from sb3_htr.rivals.base import OwnWay
 from sb3_htr.zoo.run.algorithm import ALGORITHMS, Algorithm
 from sb3_htr.zoo.run.shipped import hyperparams_file
@@ -78,6 +78,11 @@ class PEARLMethod(Method):
     rl_reward_type: str
     train_explorer: str
     explorer: str
+
+    @property
+    def is_htr(self) -> bool:
+        """Whether experience is relabelled under tasks that it reached."""
+        return self.relabel_probability > 0 and not issubclass(RELABELLERS[self.relabeller], TrainingTaskRelabelling)
 
     def hyperparams(self) -> dict[str, Any]:
         """

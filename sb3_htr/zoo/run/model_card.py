@@ -10,7 +10,7 @@ from sb3_htr.adaptation.evaluation import AdaptationRecord
 from sb3_htr.zoo.run.algorithm import Algorithm
 from sb3_htr.zoo.run.defaults import given_arguments
 from sb3_htr.zoo.run.hub import model_name
-from sb3_htr.zoo.run.method import DEFAULT, get_method, methods
+from sb3_htr.zoo.run.method import DEFAULT, PEARLMethod, get_method, methods
 from sb3_htr.zoo.run.trust import PACKAGES
 
 TAGS = (
@@ -18,7 +18,6 @@ TAGS = (
     "reinforcement-learning",
     "stable-baselines3",
     "meta-reinforcement-learning",
-    "hindsight-task-relabelling",
     "sb3_htr",
 )
 # Adaptation episodes in the table, and the last one
@@ -117,15 +116,18 @@ def model_card(record: dict[str, Any], scores: dict[str, AdaptationRecord], repo
         metric_value=f"{returns.mean():.2f} +/- {returns.std():.2f}",
         verified=False,
     )
-    data = ModelCardData(library_name="stable-baselines3", tags=[env_id, *TAGS], model_name=name, eval_results=[result])
+    # A method of another version says no more than its name
+    method = methods().get(name)
+    tags = [env_id, *TAGS]
+    if isinstance(method, PEARLMethod) and method.is_htr:
+        tags.append("hindsight-task-relabelling")
+    data = ModelCardData(library_name="stable-baselines3", tags=tags, model_name=name, eval_results=[result])
     kwargs = "".join(f", {key}={value!r}" for key, value in record["env_kwargs"].items())
     is_hidden = env_id.startswith("HiddenGoal/")
     packages = [*(record["gym_packages"] or []), *(["htr_envs"] if is_hidden or not record["gym_packages"] else [])]
     imports = "".join(f"import {package}  # registers the env\n" for package in packages)
     if is_hidden:
         imports += f'htr_envs.hide_goal("{env_id.partition("/")[2]}")  # registers the family\n'
-    # A method of another version says no more than its name
-    method = methods().get(name)
     about = PEARL if method is None else method.about
     algorithm = (method or get_method(DEFAULT)).algorithm
     model = model_name(env_id, algorithm.name)
