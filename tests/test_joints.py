@@ -28,6 +28,7 @@ from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
 from sb3_htr.experiments import grid
 from sb3_htr.htr import Relabeller
 from sb3_htr.htr.relabel import RELABELLERS, HindsightDraw
+from sb3_htr.pearl.encoder import ContextEncoder
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run import method
 from sb3_htr.zoo.run.agents import RECORD, agent_at
@@ -114,6 +115,13 @@ class GRUEncoder(nn.Module):
         mean, raw = self.head(state[:, 1:]).chunk(2, dim=-1)
         nothing = state[:, :1] == 0
         return mean.masked_fill(nothing, 0.0), (F.softplus(raw) + 1e-3).masked_fill(nothing, 1.0)
+
+
+class Forgetful(ContextEncoder):
+    """With dropout, which is for learning alone."""
+
+    def extend(self, state: th.Tensor, rows: th.Tensor, lengths: th.Tensor) -> th.Tensor:
+        return super().extend(state, F.dropout(rows, 0.3, self.training), lengths)
 
 
 class Heights(TaskFamily):
@@ -246,6 +254,27 @@ def test_an_explorer(tiny_pearl: MakePEARL, tmp_path: Path, monkeypatch: pytest.
 
 
 # --- an encoder
+
+
+def test_what_an_encoder_does_in_training_alone_is_not_done_at_meta_test(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl(policy_kwargs=with_policy(encoder_class=Forgetful)).learn(2 * ROLLOUT)
+    model.policy.set_training_mode(True)
+    before = th.get_rng_state()
+    explorer = {"name": "prior", "n_exploration_episodes": 1}
+    records = [evaluate_adaptation(model, ENV_ID, n_episodes=3, explorer=explorer) for _ in range(2)]
+    np.testing.assert_array_equal(records[0], records[1])
+    assert th.equal(before, th.get_rng_state())
+
+    class Watched(Forgetful):
+        def extend(self, state: th.Tensor, rows: th.Tensor, lengths: th.Tensor) -> th.Tensor:
+            seen.append(self.training)
+            return super().extend(state, rows, lengths)
+
+    seen: list[bool] = []
+    model = tiny_pearl(policy_kwargs=with_policy(encoder_class=Watched))
+    learnt, model.knowledge.learn = model.knowledge.learn, lambda *args: (seen.clear(), learnt(*args))  # type: ignore
+    model.learn(2 * ROLLOUT)
+    assert seen and not any(seen), "nor where particles are inferred"
 
 
 def test_an_encoder(tiny_pearl: MakePEARL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,6 +13,8 @@ from sb3_htr.adaptation.task_bank import MAX_HINDSIGHT_TASKS, MAX_TRAIN_TASKS, T
 # Quantiles of what unrewarded and rewarded steps return beside what the model says is task-free; rewards are told from the
 # model's errors by the middle between the two
 UNREWARDED, REWARDED = 0.999, 0.001
+# Steps that are looked at under all tasks at once, to bound memory
+CHUNK = 2**14
 # Before anything is known, above 0 and below what a success is worth where it is worth 1
 INITIAL_THRESHOLD = 0.5
 
@@ -144,11 +146,14 @@ class LatentKnowledge(nn.Module):
         # Of the steps that are rewarded: chance of a reward, and reward to be expected, under each task
         success = th.as_tensor(solved.success, device=policy.device)
         episode = th.repeat_interleave(th.arange(len(z), device=z.device), lengths)
-        states, tasks = model.state_tower(next_obs), model.task_tower(z)
-        chance = model.success_logits(states, tasks).sigmoid() * success[:, None]
-        expected = chance * model.success_rewards(states, tasks).clamp(min=0)
+        tasks = model.task_tower(z)
+        overlap, earned = (th.zeros(len(z), len(z), device=z.device) for _ in range(2))
+        for of_chunk in th.arange(len(data), device=z.device).split(CHUNK):
+            states = model.state_tower(next_obs[of_chunk])
+            chance = model.success_logits(states, tasks).sigmoid() * success[of_chunk, None]
+            overlap.index_add_(0, episode[of_chunk], chance)
+            earned.index_add_(0, episode[of_chunk], chance * model.success_rewards(states, tasks).clamp(min=0))
         n_rewarded = th.zeros_like(z[:, 0]).index_add(0, episode, success.to(z.dtype)).clamp(min=1)[:, None]
-        overlap, earned = (th.zeros(len(z), len(z), device=z.device).index_add(0, episode, x) for x in (chance, expected))
         overlap /= n_rewarded
         share = (earned / earned.diag().clamp(min=1e-6)[:, None]).clamp(0, 1.2).fill_diagonal_(1)
         is_train, returns = (th.as_tensor(x, device=z.device) for x in (solved.is_train, solved.returns))

@@ -6,7 +6,7 @@ import numpy as np
 import torch as th
 
 from sb3_htr.common.checks import missing_hook
-from sb3_htr.common.random_state import get_generator_state, set_generator_state
+from sb3_htr.common.random_state import get_generator_state, set_generator_state, stream
 from sb3_htr.common.task_reward import ROUNDING
 from sb3_htr.common.type_aliases import TaskFamily
 from sb3_htr.htr.episode_store import evenly_spread
@@ -79,7 +79,7 @@ class TaskBank:
         """
         :param seed: of the choice of candidates
         """
-        self._rng = np.random.default_rng(seed)
+        self._rng = stream(seed, "bank")
 
     def on_episode(self, task: int, episode: np.ndarray) -> None:
         """

@@ -39,7 +39,8 @@ class ObservationNormalizer(nn.Module):
         moments = RunningMeanStd(shape=self.mean.shape)
         moments.mean, moments.var = self.mean.cpu().numpy(), self.variance.cpu().numpy()
         moments.count = self.count.item()
-        moments.update(obs)
+        # A whole rollout at once: in float32 its sum would be rounded
+        moments.update(obs.astype(np.float64))
         self.mean.copy_(th.from_numpy(moments.mean))
         self.variance.copy_(th.from_numpy(moments.var))
         self.count.fill_(moments.count)

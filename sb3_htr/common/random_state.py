@@ -11,6 +11,17 @@ import torch as th
 
 # The largest that all generators take
 MAX_SEED = 2**32 - 1
+# Parts of a model that draw, each apart from the others
+STREAMS = ("replay", "relabelling", "rollouts", "bank")
+
+
+def stream(seed: int | None, name: str) -> np.random.Generator:
+    """
+    :param seed: of a model
+    :param name: one of :data:`STREAMS`
+    :return: generator of this part, whose draws say nothing about those of other parts and of the envs
+    """
+    return np.random.default_rng(np.random.SeedSequence(seed).spawn(len(STREAMS))[STREAMS.index(name)])
 
 
 def get_generator_state(generator: np.random.Generator) -> str:

@@ -44,7 +44,8 @@ class Resumable(BaseAlgorithm):
 
         :param state: of :meth:`state_dict` of a model with the same settings
         """
-        self.set_parameters(state["parameters"], exact_match=True, device=self.device)
+        # A copy, too: an optimizer would train on in the numbers of the state
+        self.set_parameters(deepcopy(state["parameters"]), exact_match=True, device=self.device)
         if getattr(self, "log_ent_coef", None) is not None:
             self.log_ent_coef.data.copy_(state["log_ent_coef"])  # type: ignore[attr-defined]
         for name, value in state["counters"].items():

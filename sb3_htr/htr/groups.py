@@ -17,3 +17,13 @@ def positions(lengths: np.ndarray) -> np.ndarray:
     :return: (sum of the lengths,) int, of each row the place in its group: 0, 1, ... for each of them
     """
     return np.arange(lengths.sum()) - np.repeat(first_rows(lengths), lengths)
+
+
+def ascending(values: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """
+    :param values: (sum of the lengths,) int, 0 or more, those of the first group first
+    :param lengths: (n,) int, values of each group
+    :return: the same, ordered within each group
+    """
+    group = np.repeat(np.arange(len(lengths)) * (values.max(initial=0) + 1), lengths)
+    return np.sort(values + group) - group

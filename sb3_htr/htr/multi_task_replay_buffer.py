@@ -10,12 +10,12 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 
 from sb3_htr.common.checks import check_has_hooks, check_same_family, family_facts, missing_hook
-from sb3_htr.common.random_state import get_generator_state, set_generator_state
+from sb3_htr.common.random_state import get_generator_state, set_generator_state, stream
 from sb3_htr.common.settings import check_numbers, make
 from sb3_htr.common.task_reward import ROUNDING, task_reward
 from sb3_htr.common.type_aliases import MultiTaskSamples, RewardLabels, TaskFamily
 from sb3_htr.htr.episode_store import EpisodeStore
-from sb3_htr.htr.groups import first_rows, positions
+from sb3_htr.htr.groups import ascending, first_rows, positions
 from sb3_htr.htr.n_step import n_step_returns, steps_ahead
 from sb3_htr.htr.relabel import RELABELLERS, Relabeller
 from sb3_htr.htr.transitions import Transitions
@@ -139,8 +139,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         """
         :param seed: seed of the two generators. Relabelling has its own, so that K = 0 changes nothing else.
         """
-        sequence = np.random.SeedSequence(seed)
-        self._rng, self.relabel_rng = (np.random.default_rng(child) for child in sequence.spawn(2))
+        self._rng, self.relabel_rng = stream(seed, "replay"), stream(seed, "relabelling")
 
     @property
     def _relabelled_by(self) -> str:
@@ -352,6 +351,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             context_source[relabelled], batch_source[relabelled] = hindsight.context, hindsight.batch
             reward_task[relabelled] = hindsight.tasks
         context, n_context = spread(self._rng, context_source, context_size)
+        context = ascending(context, n_context)  # an encoder may read it in the order of time
         batch, n_batch = spread(self._rng, batch_source, batch_size)
         virtual = np.concatenate([context, batch])
         task_of_row = np.concatenate([np.repeat(np.arange(meta_batch_size), n) for n in (n_context, n_batch)])
@@ -375,7 +375,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         context_rows, steps = rows[: len(context)], rows[rl].reshape(len(batch), n_steps, -1)
         first, last = steps[:, 0], steps[:, -1]
         returns, discounts = n_step_returns(steps[..., columns.reward], n_ahead, gamma)
-        beside = first[:, columns.reward] - first[:, columns.task_free_reward]
+        beside = np.abs(steps[..., columns.reward] - steps[..., columns.task_free_reward]).max(axis=1)
         return MultiTaskSamples(
             context=columns.context(context_rows, n_context, self.device),
             observations=self._tensor(first[:, columns.observation]),
@@ -387,7 +387,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             lengths=self._tensor(n_batch),
             task_ids=tasks,
             relabelled=relabelled,
-            unrewarded=np.logical_and.reduceat(np.abs(beside) <= ROUNDING, first_rows(n_batch)),
+            unrewarded=np.logical_and.reduceat(beside <= ROUNDING, first_rows(n_batch)),
             labels=self._label(first, context_rows, n_context, reward_task, n_labelled),
         )
 

@@ -31,7 +31,7 @@ from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.callback import followed_by
 from sb3_htr.common.latent_policy import Obs, State
 from sb3_htr.common.progress import MetaProgressBarCallback
-from sb3_htr.common.random_state import MAX_SEED, get_generator_state, seeded_actions, set_generator_state
+from sb3_htr.common.random_state import MAX_SEED, get_generator_state, seeded_actions, set_generator_state, stream
 from sb3_htr.common.saving import CheckedFiles, with_suffix
 from sb3_htr.common.settings import check_keywords, check_numbers
 from sb3_htr.common.training_state import Resumable
@@ -271,7 +271,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         :param seed: seed of python, numpy, torch, envs, rollout tasks, replay buffer and task bank
         """
         super().set_random_seed(seed)
-        self._rng = np.random.default_rng(seed)
+        self._rng = stream(seed, "rollouts")
         if isinstance(self.replay_buffer, MultiTaskReplayBuffer) and seed is not None:
             self.replay_buffer.seed(seed)
         if self.task_bank is not None and seed is not None:
@@ -472,6 +472,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         chosen = own if explorer in (None, own.name) else to_explorer(explorer)
         self._check_explorer(chosen)
         check_numbers(n_envs=(n_envs, 1))
+        self.policy.set_training_mode(False)
         return Adaptation(
             self.policy,
             self.knowledge,

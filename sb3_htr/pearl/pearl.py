@@ -216,6 +216,7 @@ class PEARL(OffPolicyMetaAlgorithm):
         self.logger.record("train/kl_coef", self._current_kl_coef())
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         assert self.task_bank is not None
+        self.policy.set_training_mode(False)
         self.knowledge.learn(self.policy, th.cat(means[-20:]), self.task_bank, self.gamma)
 
     def _current_kl_coef(self) -> float:

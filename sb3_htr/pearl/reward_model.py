@@ -95,13 +95,14 @@ class RewardModel(nn.Module):
         success = (labels.reward > 0).to(labels.reward.dtype)
         cross_entropy = F.binary_cross_entropy_with_logits(self.success_logits(states, tasks), success, reduction="none")
         with th.no_grad():
+            # Below the bound it would have no gradient, and stay there for ever
+            self.log_std.clamp_(min=MIN_LOG_STD)
             n_successes = success.sum()
             mean = labels.reward.sum() / n_successes.clamp(min=1)
             rate = th.where(self.scale > 0, SCALE_RATE, 1.0) * (n_successes > 0)
             self.scale.lerp_(mean, rate)
-        log_std = self.log_std.clamp(min=MIN_LOG_STD)
         error = (self.success_rewards(states, tasks) - labels.reward) / self.scale.clamp(min=1e-6)
-        nll = 0.5 * error.square() * (-2 * log_std).exp() + log_std
+        nll = 0.5 * error.square() * (-2 * self.log_std).exp() + self.log_std
         return (cross_entropy * weight).sum(), (nll * success * weight).sum()
 
 

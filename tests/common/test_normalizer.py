@@ -1,6 +1,7 @@
 """Observations on one scale: the numbers of SB3's VecNormalize, inside of the policy."""
 
 import numpy as np
+import pytest
 import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
@@ -18,7 +19,7 @@ def test_it_follows_what_was_observed_as_vec_normalize_does(batches: list[tuple[
     for n, mean, deviation in batches:
         obs = rng.normal(mean, deviation, (n, 3)).astype(np.float32)
         normalizer.update(obs)
-        theirs.update(obs)
+        theirs.update(obs.astype(np.float64))
     np.testing.assert_allclose(normalizer.mean, theirs.mean, rtol=1e-12)
     np.testing.assert_allclose(normalizer.variance, theirs.var, rtol=1e-12)
     obs = rng.normal(0, 200, (50, 3)).astype(np.float32)
@@ -38,3 +39,11 @@ def test_nothing_observed_changes_nothing_within_the_bounds_and_a_state_is_all_t
         one.update(np.ones((3, 2)))
     assert th.equal(normalizer(obs), other(obs))
     assert not list(normalizer.parameters()), "gradients have no say in it"
+
+
+def test_a_large_rollout_is_not_rounded_away() -> None:
+    normalizer, rng = ObservationNormalizer(1), np.random.default_rng(0)
+    for _ in range(3):
+        normalizer.update((1000 + 0.1 * rng.standard_normal((200_000, 1))).astype(np.float32))
+    assert normalizer.mean.item() == pytest.approx(1000, abs=1e-3)
+    assert normalizer.variance.item() ** 0.5 == pytest.approx(0.1, rel=0.01)

@@ -337,3 +337,24 @@ def test_hindsight_tasks_are_not_rounded_where_training_tasks_are_integers() -> 
     buffer.task_family = copy.copy(buffer.task_family)
     buffer.task_family.train_tasks = np.round(buffer.task_family.train_tasks).astype(int)
     assert not buffer.sample(20, meta_batch_size=50, context_size=20).unrewarded.any()
+
+
+@given(seed=st.integers(0, 2**20), k=st.sampled_from([0.0, 0.5, 1.0]), size=st.integers(1, 30))
+def test_contexts_are_in_the_order_of_time(seed: int, k: float, size: int) -> None:
+    """For encoders that read them so, as at meta-test."""
+    buffer = filled(n_episodes=8, relabel_probability=k, seed=seed)
+    order = {row.tobytes(): i for i, row in enumerate(buffer.episodes.take(np.arange(buffer.size()))[:, :4])}
+    context = buffer.sample(4, meta_batch_size=8, context_size=size).context
+    rows = np.column_stack([context.observations, context.actions]).astype(np.float32)
+    for one in by_task(rows, context.lengths):
+        places = [order[row.tobytes()] for row in one]
+        assert places == sorted(places)
+
+
+@pytest.mark.parametrize("n_steps", [1, 3, 10])
+def test_what_is_unrewarded_is_what_the_rewards_of_the_batch_say(n_steps: int) -> None:
+    buffer = filled(n_episodes=20, relabel_probability=0.5, seed=1)
+    data = buffer.sample(3, meta_batch_size=200, n_steps=n_steps)
+    without = [not rewards.any() for rewards in by_task(data.rewards.numpy(), data.lengths)]
+    assert 0 < np.mean(without) < 1
+    np.testing.assert_array_equal(data.unrewarded, without)

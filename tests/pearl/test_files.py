@@ -257,6 +257,12 @@ def test_a_state_is_a_copy(tiny_pearl: MakePEARL) -> None:
     after = parameters(model)
     assert all(th.equal(value, after[name]) for name, value in before.items())
     assert th.equal(entropy, model.log_ent_coef)  # type: ignore[arg-type]
+    # What goes on from it leaves it as it is, its optimizers included
+    twins = []
+    for _ in range(2):
+        model.load_state_dict(state)
+        twins.append(parameters(model.learn(ROLLOUT, reset_num_timesteps=False)))
+    assert all(th.equal(value, twins[1][name]) for name, value in twins[0].items())
 
 
 def test_settings_of_an_untrusted_file_are_joined_with_those_given(tiny_pearl: MakePEARL, tmp_path: Path) -> None:

@@ -410,3 +410,13 @@ def test_a_scalar_that_is_no_index_is_no_task(tiny_pearl: MakePEARL) -> None:
 def test_every_argument_is_documented() -> None:
     for name in inspect.signature(PEARL.__init__).parameters:
         assert name == "self" or f":param {name}:" in (PEARL.__doc__ or ""), name
+
+
+def test_parts_that_draw_do_so_apart_from_each_other(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl(seed=3)
+    assert model.replay_buffer is not None and model.task_bank is not None and model.env is not None
+    buffer = model.replay_buffer
+    model.env.seed(3)
+    model.env.reset()
+    generators = [model._rng, model.task_bank._rng, buffer._rng, buffer.relabel_rng, model.env.get_attr("np_random")[0]]
+    assert len({generator.integers(2**60) for generator in generators}) == len(generators)

@@ -4,7 +4,7 @@ import pytest
 import torch as th
 
 from sb3_htr.common.type_aliases import RewardLabels
-from sb3_htr.pearl.reward_model import RewardModel
+from sb3_htr.pearl.reward_model import MIN_LOG_STD, RewardModel
 
 RADIUS = 0.4
 
@@ -50,3 +50,15 @@ def test_a_task_of_which_nothing_was_rewarded_teaches_nothing() -> None:
     assert of_goals[:4].abs().sum() > 0 and not of_goals[4:].any()
     nothing = labels._replace(inferred=th.zeros(8))
     assert [loss.item() for loss in model.losses(states, goals, nothing)] == [0.0, 0.0]
+
+
+def test_a_deviation_that_became_too_small_grows_again() -> None:
+    """Also from below its bound, where an update can leave it."""
+    model = RewardModel(2, 1, 2)
+    reward = 1 + 0.5 * th.randn(64, 8).abs()
+    labels = RewardLabels(th.arange(64), th.zeros(64, 2), reward, th.zeros(64), th.ones(8))
+    with th.no_grad():
+        model.log_std.fill_(MIN_LOG_STD - 0.01)
+    _, loss = model.losses(th.randn(64, 2), th.randn(8, 2), labels)
+    loss.backward()
+    assert model.log_std.grad is not None and model.log_std.grad < 0, "descent makes it larger"
