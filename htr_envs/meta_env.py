@@ -141,7 +141,33 @@ def checked_action(action: ArrayLike, space: spaces.Space[Any]) -> NDArray[np.fl
     return checked
 
 
-class MetaEnv(gym.Env[FloatArray, FloatArray], ABC):
+class HasTaskFamily:
+    """An env's tasks are those of its family."""
+
+    task_family: TaskDistribution
+
+    @property
+    def task_space(self) -> spaces.Box:
+        """The box that every task lies in."""
+        return self.task_family.task_space
+
+    @property
+    def train_tasks(self) -> FloatArray:
+        """Tasks to meta-train on, shape (n, task_dim), read-only."""
+        return self.task_family.train_tasks
+
+    @property
+    def validation_tasks(self) -> FloatArray:
+        """Tasks to choose hyper-parameters and checkpoints on, shape (n, task_dim), read-only."""
+        return self.task_family.validation_tasks
+
+    @property
+    def test_tasks(self) -> FloatArray:
+        """Tasks to report results on, shape (n, task_dim), read-only."""
+        return self.task_family.test_tasks
+
+
+class MetaEnv(HasTaskFamily, gym.Env[FloatArray, FloatArray], ABC):
     """An environment that is given tasks, which may change its rewards, dynamics and terminations.
 
     PEARL learns it without relabelling. A subclass sets ``observation_space`` and ``action_space`` and writes ``_reset_state``
@@ -272,23 +298,3 @@ class MetaEnv(gym.Env[FloatArray, FloatArray], ABC):
     def task_id(self) -> int:
         """Index of the current episode's task in ``train_tasks``, -1 for a task given as a vector."""
         return self._current_task()[0]
-
-    @property
-    def task_space(self) -> spaces.Box:
-        """The box that every task lies in."""
-        return self.task_family.task_space
-
-    @property
-    def train_tasks(self) -> FloatArray:
-        """Tasks to meta-train on, shape (n, task_dim), read-only."""
-        return self.task_family.train_tasks
-
-    @property
-    def validation_tasks(self) -> FloatArray:
-        """Tasks to choose hyper-parameters and checkpoints on, shape (n, task_dim), read-only."""
-        return self.task_family.validation_tasks
-
-    @property
-    def test_tasks(self) -> FloatArray:
-        """Tasks to report results on, shape (n, task_dim), read-only."""
-        return self.task_family.test_tasks

@@ -12,11 +12,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from htr_envs.meta_env import checked_action, task_from_options
+from htr_envs.meta_env import HasTaskFamily, checked_action, task_from_options
 from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, check_reward_type
 
 
-class TaskVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]], ABC):
+class TaskVectorEnv(HasTaskFamily, VectorEnv[FloatArray, FloatArray, NDArray[Any]], ABC):
     """Many copies of a task environment that step together, without a loop over them.
 
     A subclass writes the same two hooks as for :class:`htr_envs.TaskEnv`, on arrays. The rule on tasks is the same too, for
@@ -43,6 +43,7 @@ class TaskVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]], ABC):
     :raises ValueError: if the reward type is unknown or a number is smaller than 1.
     """
 
+    task_family: TaskFamily
     metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # type: ignore[misc]
 
     def __init__(
@@ -202,23 +203,3 @@ class TaskVectorEnv(VectorEnv[FloatArray, FloatArray, NDArray[Any]], ABC):
     def _check_begun(self) -> None:
         if self._observations is None:
             raise ResetNeeded("The envs have no tasks before their first reset: call reset() first.")
-
-    @property
-    def task_space(self) -> spaces.Box:
-        """The box that every task lies in."""
-        return self.task_family.task_space
-
-    @property
-    def train_tasks(self) -> FloatArray:
-        """Tasks to meta-train on, shape (n, task_dim), read-only."""
-        return self.task_family.train_tasks
-
-    @property
-    def validation_tasks(self) -> FloatArray:
-        """Tasks to choose hyper-parameters and checkpoints on, shape (n, task_dim), read-only."""
-        return self.task_family.validation_tasks
-
-    @property
-    def test_tasks(self) -> FloatArray:
-        """Tasks to report results on, shape (n, task_dim), read-only."""
-        return self.task_family.test_tasks
