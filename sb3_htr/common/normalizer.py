@@ -40,7 +40,8 @@ class ObservationNormalizer(nn.Module):
         moments.mean, moments.var = self.mean.cpu().numpy(), self.variance.cpu().numpy()
         moments.count = self.count.item()
         # A whole rollout at once: in float32 its sum would be rounded
-        moments.update(obs.astype(np.float64))
+        mean, variance = obs.mean(axis=0, dtype=np.float64), obs.var(axis=0, dtype=np.float64)
+        moments.update_from_moments(mean, variance, len(obs))
         self.mean.copy_(th.from_numpy(moments.mean))
         self.variance.copy_(th.from_numpy(moments.var))
         self.count.fill_(moments.count)
