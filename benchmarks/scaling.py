@@ -231,12 +231,12 @@ def plot(panels: list[tuple[str, list[int], Curves]]) -> None:
     """
     :param panels: what :func:`measure` gives
     """
-    figure, all_axes = plt.subplots(2, 3, figsize=(11, 7.2), layout="constrained")
+    figure, all_axes = plt.subplots(2, 3, figsize=(13, 7.6), layout="constrained")
     for axes, (name, sizes, curves) in zip(all_axes.flat, panels, strict=True):
         for colour, (what, (unit, values)) in zip(COLOURS, curves.items(), strict=False):
             axes.loglog(sizes, values, "o-", color=colour, label=f"{what} ({unit})", markersize=4)
         axes.set_xlabel(name)
-        axes.set_ylim(0.03, 2e4)
+        axes.set_ylim(0.02, 2e4)
     finish(figure, PICTURE, "Duration as work grows, one thread; both axes are logarithmic")
 
 
