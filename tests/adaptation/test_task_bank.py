@@ -263,3 +263,17 @@ def test_episodes_that_wait_for_the_next_update_are_saved(tiny_pearl: MakePEARL,
         ours.update()
     np.testing.assert_array_equal(restored.tasks, bank.tasks)
     np.testing.assert_array_equal(restored.best_return, bank.best_return)
+
+
+def test_particles_are_the_same_however_many_steps_are_looked_at_at_once(
+    tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = tiny_pearl(make_task_vec_env(ENV_ID, 4, env_kwargs={"goal_distance": 0.3})).learn(2 * ROLLOUT)
+    assert model.task_bank is not None and model.task_bank.n_solved > 0
+    found = []
+    for chunk in (2**14, 7):
+        monkeypatch.setattr("sb3_htr.adaptation.knowledge.CHUNK", chunk)
+        with th.no_grad():
+            found.append(model.knowledge._solved(model.policy, model.task_bank, model.gamma))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
