@@ -203,6 +203,8 @@ def test_what_is_sampled_makes_a_model_of_the_method_and_is_what_is_loaded(name:
         trial = study.ask()
         sampled = sample_pearl_params(trial, *how)
         assert sampled == convert_pearl_params(trial.params) and 0.8 <= sampled["gamma"] < 1
+        assert sampled["learning_rate"] == f"lin_{trial.params['learning_rate']}"
+        sampled = MetaExperimentManager._preprocess_schedules(sampled)
         model = PEARL("MlpPolicy", ENV_ID, **merged(method.hyperparams(), sampled))
         assert model.policy.latent_dim == trial.params["latent_dim"]
         assert model.policy.encoder_arch == ENCODER_ARCHS[trial.params["encoder_arch"]]
@@ -231,6 +233,7 @@ def test_what_a_user_gives_is_not_searched(tmp_path: Path, monkeypatch: pytest.M
     searched = {"learning_rate", "tau", "ent_coef", "kl_coef", "latent_dim", "n_steps"}
     assert set(trial.params) == {*searched, "relabel_probability", "hindsight_task_strategy"}
     (model,) = made
+    assert model.lr_schedule(0.5) == pytest.approx(trial.params["learning_rate"] / 2)
     assert (model.gamma, model.gradient_steps, model.batch_size, model.meta_batch_size) == (0.5, 3, 4, 8)
     assert (model.policy.net_arch, model.policy.encoder_arch) == ([16], [16])
     assert (model.policy.latent_dim, model.tau) == (trial.params["latent_dim"], trial.params["tau"])
@@ -257,6 +260,9 @@ def test_a_trial_joins_the_settings_of_the_file(tmp_path: Path) -> None:
     expected = {"relabel_probability": 0.3, "rl_reward_type": "sparse"}
     assert model.replay_buffer_kwargs == {**expected, "relabeller": {**relabeller, "hindsight_task_strategy": strategy}}
     assert model.gradient_steps == 2, "-params wins over the trial"
+    # The rate falls to 0, as PEARL's default does
+    rates = [model.learning_rate(remaining) for remaining in (1.0, 0.5, 0.0)]  # type: ignore[operator]
+    assert rates == pytest.approx([0.002, 0.001, 0.0])
 
 
 def test_hyperparameters_that_diverge_are_pruned(quick: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -369,7 +369,9 @@ class MetaExperimentManager(ExperimentManager):
                 "hindsight_task_strategy" in self.method.relabeller_settings(),
                 names_of(self._given),
             )
-            HYPERPARAMS_SAMPLER[self.algo] = lambda trial, *_: merged(self._hyperparams, sample_pearl_params(trial, *how))
+            HYPERPARAMS_SAMPLER[self.algo] = lambda trial, *_: merged(
+                self._hyperparams, self._preprocess_schedules(sample_pearl_params(trial, *how))
+            )
             return super().objective(trial)
         except DivergedError as error:
             print(f"Trial {trial.number} is pruned: {error}")

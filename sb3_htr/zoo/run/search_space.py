@@ -18,7 +18,8 @@ ENCODER_ARCHS = {"small": [64, 64], "medium": [128, 128], "paper": [200, 200, 20
 ARCHS = {"net_arch": NET_ARCHS, "encoder_arch": ENCODER_ARCHS}
 
 
-# Drawn from their logarithm; episodes have some tens to hundreds of steps, which is what the discount must reach over
+# Drawn from their logarithm. The learning rate is that of the beginning, and falls to 0 as PEARL's default does; episodes have
+# some tens to hundreds of steps, which is what the discount must reach over
 FLOATS = {
     "learning_rate": (1e-4, 3e-3),
     "one_minus_gamma": (0.005, 0.2),
@@ -43,7 +44,7 @@ def sample_pearl_params(
     :param relabels: whether the method relabels; how often it does is sampled then
     :param chooses_states: whether its hindsight tasks are states that an episode reached; which ones is sampled then
     :param given: names of arguments that somebody has chosen already: they are not sampled
-    :return: arguments of PEARL
+    :return: arguments of PEARL, as a YAML file of rl_zoo3 has them
     """
     choices: dict[str, Sequence[Any]] = {"net_arch": list(NET_ARCHS), "encoder_arch": list(ENCODER_ARCHS)}
     if relabels:
@@ -66,7 +67,7 @@ def _argument(name: str) -> str:
 def convert_pearl_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     """
     :param sampled_params: of a trial
-    :return: arguments of PEARL
+    :return: arguments of PEARL, as a YAML file of rl_zoo3 has them
     """
     policy: dict[str, Any] = {}
     replay: dict[str, Any] = {}
@@ -74,6 +75,8 @@ def convert_pearl_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     for name, value in sampled_params.items():
         if name == "one_minus_gamma":
             converted["gamma"] = 1 - value
+        elif name == "learning_rate":
+            converted[name] = f"lin_{value}"
         elif name.endswith("_pow"):
             converted[_argument(name)] = 2**value
         elif name == "latent_dim":
