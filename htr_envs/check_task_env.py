@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -16,6 +17,8 @@ from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory
 
 MAX_STEPS = 200  # of an episode that are looked at
 N_DRAWS = 30
+# What a step that solves nothing may be worth: the difference of two float32. More is a success to all that learns from it
+ROUNDING = 1e-5
 NOT_REPEATABLE = "The same seed, task and actions gave another episode: use no other randomness than self.np_random."
 TASK_SETS = ("train_tasks", "validation_tasks", "test_tasks")
 # What tells the reward of a step under any task; a family of a MetaEnv has none of these
@@ -61,6 +64,7 @@ def _tells_rewards(family: Any) -> bool:
 
 
 def _check_interface(env: gym.Env[Any, Any]) -> TaskFamily:
+    _require(isinstance(env, gym.Env), "check_task_env takes one env: pass gymnasium.make(id).")
     base: Any = env.unwrapped
     advice = "hide the goal of a GoalEnv with htr_envs.hide_goal, derive any other env from htr_envs.TaskEnv."
     _require(hasattr(base, "task_family"), f"The env has no `task_family`: {advice}")
@@ -108,12 +112,15 @@ def _check_family(family: TaskFamily) -> None:
         _require(_same(getattr(twin, name), getattr(family, name)), f"The pickled task family has other {name}.")
 
 
-def _check_step(env: gym.Env[Any, Any], family: TaskFamily, observation: Any, reward: Any, info: dict[str, Any]) -> None:
+def _check_observation(env: gym.Env[Any, Any], observation: Any, when: str) -> None:
     typed = isinstance(observation, np.ndarray) and observation.dtype == env.observation_space.dtype
-    _require(
-        typed and observation in env.observation_space, "An observation is not in the observation space, or of its dtype."
-    )
-    _require(np.isfinite(observation).all(), "An observation has a number that is not finite.")
+    _require(not typed or np.isfinite(observation).all(), f"An observation of {when} has a number that is not finite.")
+    fits = typed and observation in env.observation_space
+    _require(fits, f"An observation of {when} is not in the observation space, or not of its dtype.")
+
+
+def _check_step(env: gym.Env[Any, Any], family: TaskFamily, observation: Any, reward: Any, info: dict[str, Any]) -> None:
+    _check_observation(env, observation, "a step")
     _require(isinstance(reward, float) and bool(np.isfinite(reward)), f"The reward {reward!r} is not a finite float.")
     told = _tells_rewards(family)
     for key in INFO_KINDS if told else ("task_id",):
@@ -138,6 +145,7 @@ def _play(
     action_space.seed(seed)
     options = None if task is None else {"task": task}
     observation, info = _call("The env fails in a reset.", lambda: env.reset(seed=seed, options=options))
+    _check_observation(env, observation, "a reset")
     _require(type(info.get("task_id")) is int, "The info of reset lacks `task_id`, or it is no int.")
     task_id: int = info["task_id"]
     rows: list[tuple[Any, ...]] = []
@@ -264,11 +272,14 @@ def _check_sparse(family: TaskFamily, traj: Trajectory, own_tasks: FloatArray) -
     failures = task_rewards[~family.is_success(traj, tasks)]
     if len(failures) == 0:
         return
-    slack = 1e-4 * (1.0 + np.abs(traj.task_free_reward).max())
-    nothing = np.abs(failures).max() <= slack
-    _require(nothing, "The sparse reward of an unsuccessful step is not 0 (beside task_free_reward), which leaks the task.")
+    more = float(np.abs(failures).max())
+    advice = "compute_reward is what the task pays plus traj.task_free_reward."
+    leak = (
+        f"The sparse reward of an unsuccessful step is not 0 (beside task_free_reward), which leaks the task, but {more:.2g}: "
+    )
+    _require(more <= ROUNDING, leak + advice)
     worth = task_rewards[np.arange(len(own_tasks)), np.arange(len(own_tasks))]
-    _require((worth > failures.max() + slack).all(), "A step that solves its task exactly is worth no more than a failure.")
+    _require((worth > 2 * ROUNDING).all(), "A step that solves its task exactly is worth no more than a failure.")
 
 
 def _check_no_leak(plain: Episode, other: Episode) -> None:
@@ -383,8 +394,10 @@ def _check_id(env: gym.Env[Any, Any], family: TaskFamily, seed: int) -> None:
     twins: list[Any] = [_call("The env cannot be made a second time by its id.", gym.make, spec).unwrapped]
     if spec.vector_entry_point is not None:
         mode = gym.VectorizeMode.VECTOR_ENTRY_POINT
-        twins.append(_call("The batch of the id cannot be made.", lambda: gym.make_vec(spec, 1, vectorization_mode=mode)))
-        _check_batch(twins[-1], env, family, seed)
+        for n in (1, 2):
+            make = partial(gym.make_vec, spec, n, vectorization_mode=mode)
+            twins.append(_call("The batch of the id cannot be made.", make))
+            _check_batch(twins[-1], env, family, seed)
     for twin in twins:
         for name in TASK_SETS:
             told = f"Another env of the same id has other {name}: draw them with a generator whose seed is an argument."
@@ -393,16 +406,23 @@ def _check_id(env: gym.Env[Any, Any], family: TaskFamily, seed: int) -> None:
 
 
 def _check_batch(batch: Any, env: gym.Env[Any, Any], family: TaskFamily, seed: int) -> None:
+    """The first of its envs against a single one; what others beside it do makes no difference."""
     episode = _play(env, family, seed, family.train_tasks[0])
-    options = {"task_id": np.zeros(1, dtype=np.int64)}
+    options = {"task_id": np.zeros(batch.num_envs, dtype=np.int64)}
+    others = [env.action_space.high] * (batch.num_envs - 1)  # type: ignore[attr-defined]
     observations, _ = _call("The batch of the id fails in a reset.", lambda: batch.reset(seed=seed, options=options))
     if not _same(observations[0], episode.traj.observations[0]):
         return  # starts that are drawn in another way: nothing can be compared
     for action, expected, reward in zip(episode.traj.actions, episode.traj.next_observations, episode.rewards, strict=True):
-        _, told, terminated, truncated, infos = _call("The batch of the id fails in a step.", batch.step, action[None])
+        before = batch.np_random.bit_generator.state
+        actions = np.stack([action, *others])
+        _, told, terminated, truncated, infos = _call("The batch of the id fails in a step.", batch.step, actions)
+        ended = terminated | truncated
+        if others and not ended.any() and batch.np_random.bit_generator.state != before:
+            return  # noise that is drawn for several: nothing can be compared
         same = _same(infos["final_obs"][0], expected) and _same(told[0], reward)
         _require(same, "The batch of the id gives another episode than the env itself, from the same start.")
-        if terminated[0] or truncated[0]:
+        if ended[0]:
             return
 
 

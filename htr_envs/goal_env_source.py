@@ -124,8 +124,8 @@ def probe(source: GoalEnvSource) -> gym.Env[Any, Any]:
             f"{source.spec.id} is no GoalEnv: its observations must be a Dict of one-dimensional boxes observation, "
             "achieved_goal and desired_goal, and it must have compute_reward(achieved_goal, desired_goal, info)."
         )
-    if not _is_flat(action_space):
-        raise ValueError(f"The action space of {source.spec.id} is {action_space}, expected a one-dimensional Box.")
+    if not _is_flat(action_space) or not np.issubdtype(action_space.dtype, np.floating):
+        raise ValueError(f"The action space of {source.spec.id} is {action_space}, expected a one-dimensional Box of floats.")
     return env
 
 

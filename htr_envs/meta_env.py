@@ -282,6 +282,8 @@ class MetaEnv(HasTaskFamily, gym.Env[FloatArray, FloatArray], ABC):
                 f"{len(stepped)} values."
             )
         state, reward, terminated = stepped
+        if np.ndim(reward):
+            raise ValueError(f"_step_state returned a reward of shape {np.shape(reward)}, expected a number.")
         return action, self._remember_observation(state), reward, terminated
 
     def _current_task(self) -> tuple[int, FloatArray]:

@@ -15,9 +15,11 @@ from gymnasium.error import DependencyNotInstalled
 from gymnasium.wrappers import FlattenObservation, FrameStackObservation, RescaleObservation, TransformObservation
 from hypothesis import given
 from hypothesis import strategies as st
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecMonitor, VecNormalize
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL, many
+from helpers.broken_envs import LineEnv
 from htr_envs import DynamicsVectorEnv, PointRobotEnv, PointRobotFamily, PointRobotVectorEnv, check_task_env
 from htr_envs.point_robot import PointRobotDynamics
 from sb3_htr import PEARL, evaluate_adaptation, load_untrusted
@@ -94,6 +96,7 @@ def test_an_unknown_id_is_gymnasiums_business(tiny_pearl: MakePEARL) -> None:
         ({"batch_size": -1}, "batch_size is -1"),
         ({"context_size": 0}, "context_size is 0"),
         ({"n_tasks_per_rollout": 0}, "n_tasks_per_rollout is 0"),
+        ({"replay_buffer_class": HerReplayBuffer}, "replay_buffer_class is HerReplayBuffer, expected MultiTaskReplayBuffer"),
         ({"n_episodes_per_task": 0}, "n_episodes_per_task is 0"),
         ({"kl_coef": -0.1}, "kl_coef is -0.1, expected a number of at least 0"),
         ({"final_kl_coef": -0.1}, "final_kl_coef is -0.1, expected a number of at least 0"),
@@ -418,7 +421,17 @@ class Penalized(PointRobotDynamics):
         (
             Forgetful,
             Penalized,
-            r"A step that does not solve its task.* returned 0, and its info.* is -0\.1",
+            r"A step that does not solve its task.* returned 0, .* and its info.* is -0\.1",
+        ),
+        # Much less than a success, but more than rounding, and all that learns from rewards takes it for one
+        (
+            type(
+                "Inexact",
+                (PointRobotFamily,),
+                {"compute_reward": lambda *args: PointRobotFamily.compute_reward(*args) + np.float32(5e-5)},
+            ),
+            PointRobotDynamics,
+            r"A step that does not solve its task.* returned 5e-05, by compute_reward .* and its info.* is 0:",
         ),
     ],
 )
@@ -553,6 +566,31 @@ def test_an_env_that_is_on_other_tasks_than_asked_for_is_refused(tiny_pearl: Mak
             act()
 
 
+class Redraws(gym.Wrapper[Any, Any, Any, Any]):
+    """A task that is given holds for one episode, as in many envs."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        if not options:
+            self.get_wrapper_attr("set_task")(None)
+        return self.env.reset(seed=seed, options=options)
+
+
+def test_an_env_that_goes_on_to_another_task_is_refused(tiny_pearl: MakePEARL) -> None:
+    """Else one adaptation would be to the tasks of all its episodes."""
+    env = Redraws(gym.make(ENV_ID))
+    model = tiny_pearl().learn(ROLLOUT)
+    task = get_task_family(make_task_vec_env(ENV_ID)).test_tasks[0]
+    for act in (
+        lambda: tiny_pearl(env).learn(ROLLOUT),
+        lambda: evaluate_adaptation(model, env, n_episodes=2),
+        lambda: model.adapt(env, n_episodes=2, task=task),
+    ):
+        with pytest.raises(
+            ValueError, match=r"Between two episodes env 0 went from task .* by itself: a reset without options"
+        ):
+            act()
+
+
 def test_envs_of_several_families_are_refused(tiny_pearl: MakePEARL) -> None:
     """All experience would be relabelled by the rewards of the first one."""
     env = DummyVecEnv([partial(gym.make, ENV_ID, goal_radius=radius) for radius in (0.2, 0.2, 0.3)])
@@ -588,6 +626,18 @@ def test_a_reward_hook_of_another_shape_is_named() -> None:
         env.step(env.action_space.sample())
     with pytest.raises(AssertionError, match=rf"The env fails in a step\. .*{sentence}"):
         check_task_env(env)
+
+
+def test_a_reward_of_the_dynamics_that_is_no_number_is_named() -> None:
+    class Vector(LineEnv):
+        def _step_state(self, action: Any) -> Any:
+            state, reward, terminated = super()._step_state(action)
+            return state, np.array([reward]), terminated
+
+    env = Vector()
+    env.reset()
+    with pytest.raises(ValueError, match=r"_step_state returned a reward of shape \(1,\), expected a number"):
+        env.step(np.zeros(1, dtype=np.float32))
 
 
 @pytest.mark.parametrize("explorer", ["belief", "prior", "aggregate", "learned-prior"])
@@ -732,6 +782,7 @@ def test_an_episode_without_end_is_noticed(tiny_pearl: MakePEARL) -> None:
 
     with pytest.raises(ValueError, match=r"An episode goes on after 200 steps, 10 times what those of training had"):
         tiny_pearl().adapt(Endless(), n_episodes=1)
+    assert len(tiny_pearl().adapt(gym.make(ENV_ID, max_episode_steps=250), n_episodes=1).returns) == 1, "as its limit says"
 
 
 BOUNDED = spaces.Box(-5, 5, (2,), np.float32)

@@ -2,7 +2,7 @@
 
 import traceback
 from collections.abc import Callable, Iterator
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, dummy_vec_env
@@ -69,10 +69,12 @@ def adaptation_steps(
     :param obs: (n_envs, obs_dim) of that reset
     :param max_episode_steps: that episodes of training had; by default the time limit of the env
     :return: what each env did, step by step
-    :raises ValueError: for an episode that does not end, observations of another shape, rewards that are no numbers
+    :raises ValueError: for an episode that does not end, an env that goes on to another task, observations of another shape,
+        rewards that are no numbers
     """
     longest = ENDLESS * (get_max_episode_steps(env) if max_episode_steps is None else max_episode_steps)
     length = np.zeros(env.num_envs, dtype=np.int64)
+    tasks = _task_ids(env)
     if isinstance(adaptation, SeesTasks):
         adaptation.see_tasks(np.stack(env.get_attr("task")))
     remaining = np.full(env.num_envs, n_episodes)
@@ -85,6 +87,12 @@ def adaptation_steps(
         if len(ended):
             next_obs = new_obs.copy()
             next_obs[ended] = [infos[i]["terminal_observation"] for i in ended]
+            if (now := _task_ids(env)) != tasks:
+                i = next(i for i in ended if now[i] != tasks[i])
+                raise ValueError(
+                    f"Between two episodes env {i} went from task {tasks[i]} to task {now[i]} by itself: a reset without "
+                    "options, in the env or in a wrapper around it, must stay on the task."
+                )
         length = np.where(dones, 0, length + 1)
         if length.max() > longest:
             raise ValueError(
@@ -96,6 +104,11 @@ def adaptation_steps(
         yield step
         obs = new_obs
         remaining -= dones
+
+
+def _task_ids(env: VecEnv) -> list[Any]:
+    """As the envs told at their latest resets; None where they do not."""
+    return [info.get("task_id") for info in env.unwrapped.reset_infos]
 
 
 def _step(env: VecEnv, actions: np.ndarray) -> VecEnvStepReturn:

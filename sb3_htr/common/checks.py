@@ -210,7 +210,9 @@ def family_facts(family: TaskFamily) -> dict[str, str]:
             # An object that does not say what it is names its address
             return re.sub(r" at 0x[0-9a-f]+", "", repr(value))
 
-    attributes = getattr(family, "__dict__", {})
+    # Attributes of a class and slots are in no __dict__
+    tasks = {name: getattr(family, name, None) for name in ("train_tasks", "validation_tasks", "test_tasks")}
+    attributes = tasks | getattr(family, "__dict__", {})
     return {"class": type(family).__qualname__, **{name: fact(value) for name, value in sorted(attributes.items())}}
 
 

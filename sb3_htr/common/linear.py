@@ -64,12 +64,13 @@ class _Stack(th.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: th.Tensor, layers: list[_Layer], *parameters: th.Tensor) -> th.Tensor:
-        saved: list[th.Tensor] = []
+        saved: list[th.Tensor | None] = []
         remaining = iter(parameters)
         for layer in layers:
             weight, *others = (next(remaining) for _ in range(layer.n_parameters))
             y, kept = _forward(x, layer, weight, *others)
-            saved += [x, y, weight, *others[1:], *kept]
+            # Who is not rectified may overwrite what it is given, as with torch's layers
+            saved += [x, y if layer.rectified else None, weight, *others[1:], *kept]
             x = y
         ctx.layers = layers
         ctx.save_for_backward(*saved)
@@ -89,8 +90,8 @@ class _Stack(th.autograd.Function):
             learns = needed[-layer.n_parameters :]
             del needed[-layer.n_parameters :]
             # The gradient of the output belongs to others, and those of layers within to nobody else
-            own = grad if i < len(steps) - 1 else th.empty_like(y)
             if layer.rectified:
+                own = grad if i < len(steps) - 1 else th.empty_like(y)
                 grad = th.ops.aten.threshold_backward.grad_input(grad, y, 0, grad_input=own)
             of_normalization: list[th.Tensor | None] = []
             if layer.eps is not None:

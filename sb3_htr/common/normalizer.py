@@ -27,8 +27,8 @@ class ObservationNormalizer(nn.Module):
         super().__init__()
         self.register_buffer("mean", th.zeros(obs_dim, dtype=th.float64))
         self.register_buffer("variance", th.ones(obs_dim, dtype=th.float64))
-        # As RunningMeanStd begins
-        self.register_buffer("count", th.tensor(1e-4, dtype=th.float64))
+        # RunningMeanStd begins as if it had seen a little of a 0, which is far off where observations have an offset
+        self.register_buffer("count", th.zeros((), dtype=th.float64))
 
     def update(self, obs: np.ndarray) -> None:
         """

@@ -73,10 +73,10 @@ def seeded_actions(seed: int, deterministic: bool) -> Iterator[None]:
     """
     Actions that are drawn within, by torch's global generator, are those of a seed; then the generator is as it was before.
 
-    :param seed: of the actions
+    :param seed: of an evaluation; other draws of it, as those of z, have generators of this very seed
     :param deterministic: whether none are drawn
     """
     with th.random.fork_rng(enabled=not deterministic):
         if not deterministic:
-            th.manual_seed(seed)
+            th.manual_seed(int(np.random.SeedSequence(seed).generate_state(1)[0]))
         yield

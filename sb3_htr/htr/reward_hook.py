@@ -40,13 +40,15 @@ def check_reward_hook(
     check_rewards_told(given, computed, task)
     _check_whole_episodes(family, columns, episodes[:MAX_WHOLE], computed, solved)
     _check_worth(family, columns, np.stack([episode[-1] for _, episode in episodes]))
-    worthless = ~solved & (np.abs(given - traj.task_free_reward[:, 0]) > 1e-4 + 10 * ROUNDING * np.abs(given))
+    # What is more than rounding is a success to all that learns from it
+    beside = np.maximum(*(np.abs(reward - traj.task_free_reward[:, 0]) for reward in (given, computed)))
+    worthless = ~solved & (beside > ROUNDING)
     if worthless.any():
         i = int(worthless.argmax())
         raise ValueError(
-            f"A step that does not solve its task, by is_success, returned {given[i]:g}, and its info['task_free_reward'] is "
-            f"{traj.task_free_reward[i, 0]:g}: they must be the same. compute_reward is what the task pays plus "
-            "traj.task_free_reward."
+            f"A step that does not solve its task, by is_success, returned {given[i]:.7g}, by compute_reward "
+            f"{computed[i]:.7g}, and its info['task_free_reward'] is {traj.task_free_reward[i, 0]:.7g}: they must be the same. "
+            "compute_reward is what the task pays plus traj.task_free_reward."
         )
     ended = rows[:, columns.done] > 0
     if is_relabelled and ended.any() and (ended == solved).all():

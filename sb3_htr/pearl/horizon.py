@@ -8,8 +8,8 @@ from sb3_htr.common.settings import check_numbers
 STEPS_PER_TASK = 400
 # Env steps of a rollout for each update
 STEPS_PER_UPDATE = 20
-# The discount reaches as far as the time limit, up to here
-MAX_GAMMA = 0.98
+# The discount reaches as far as the time limit, within these; after a single step nothing comes
+MIN_GAMMA, MAX_GAMMA = 0.5, 0.98
 # By measurement, 3 for the Wheeled robot and the ant (200 steps an episode) and 10 for a maze (600)
 STEPS_PER_RETURN, MAX_N_STEPS = 60, 10
 # Transitions per task in an update: an episode, up to so many
@@ -35,7 +35,7 @@ def settings_for(max_episode_steps: int, n_tasks_per_rollout: int, n_episodes_pe
     rollout = n_tasks_per_rollout * n_episodes * max_episode_steps
     n_transitions = min(max_episode_steps, MAX_TRANSITIONS)
     return {
-        "gamma": min(max(1 - 2 / max_episode_steps, 0.0), MAX_GAMMA),
+        "gamma": min(max(1 - 2 / max_episode_steps, MIN_GAMMA * (max_episode_steps > 1)), MAX_GAMMA),
         "n_steps": min(max(max_episode_steps // STEPS_PER_RETURN, 1), MAX_N_STEPS),
         "n_episodes_per_task": n_episodes,
         # SB3 learns beyond so many steps, and this is after the first rollout

@@ -115,6 +115,11 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
             seed = int(seed)  # numpy's are no seeds for Python's own generator
         self.explorer, self.train_explorer = to_explorer(explorer), to_explorer(train_explorer)
         buffer_class = replay_buffer_class or MultiTaskReplayBuffer
+        if not issubclass(buffer_class, MultiTaskReplayBuffer):
+            raise ValueError(
+                f"replay_buffer_class is {buffer_class.__name__}, expected MultiTaskReplayBuffer, which relabels by itself, or "
+                "a subclass of it: leave it out."
+            )
         check_keywords("replay_buffer_kwargs", replay_buffer_kwargs or {}, buffer_class, without=GIVEN_BY_MODEL)
         if isinstance(env, str):
             env = make_task_vec_env(env, n_tasks_per_rollout, seed=seed)
@@ -499,8 +504,8 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         :param env: env with the task, or an id. It need not be of the task family that the model knows, or of any: an env of
             the same spaces, such as the real robot, is enough, if its episodes are all of one task
         :param n_episodes: episodes to adapt in. The agent then acts with the ``final_z`` of the explorer: of ``"belief"``, z
-            of the best one that had a single z, else the z that it acted with last; of ``"prior"``, a draw from the posterior
-            over all of them
+            of the best one that had a single z, or the one that promises most, where that found little of what there is; of
+            ``"prior"``, a draw from the posterior over all of them
         :param task: index of a training task or task vector; by default the task that the env was given, or one that it draws.
             The env keeps it. An env without task family takes none
         :param explorer: an explorer, its name, or its name and settings; the model's own by default
@@ -515,8 +520,10 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         if vec_env.num_envs != 1:
             raise ValueError(f"adapt() adapts to one task, but the VecEnv has {vec_env.num_envs} envs: pass a single env.")
         self.check_env(vec_env)
+        # What has no task family may have no time limit that could be read, as a robot
+        longest = self.max_episode_steps
         if vec_env.has_attr("task_family"):
-            checks.get_max_episode_steps(vec_env)
+            longest = checks.get_max_episode_steps(vec_env)
             if task is None:
                 vec_env.reset()
                 # Of an env that names its task by the index alone, that
@@ -537,9 +544,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         elif task is not None:
             checks.check_task_ids(vec_env, np.atleast_1d(task))
         with seeded_actions(seed, deterministic):
-            for step in adaptation_steps(
-                vec_env, adaptation, n_episodes, self.policy.unscale_action, act, obs, self.max_episode_steps
-            ):
+            for step in adaptation_steps(vec_env, adaptation, n_episodes, self.policy.unscale_action, act, obs, longest):
                 episode = adaptation.n_episodes[0] - step.dones[0]
                 returns[episode] += step.rewards[0]
                 # Some envs give a number

@@ -16,6 +16,7 @@ from helpers import ENV_ID, MakePEARL, with_policy
 from helpers.bombs import bombs
 from sb3_htr import AdaptedAgent
 from sb3_htr.adaptation import Step
+from sb3_htr.common.random_state import seeded_actions
 
 pytestmark = pytest.mark.filterwarnings("ignore:No reward was found")
 
@@ -131,6 +132,9 @@ def test_sampled_actions_of_an_adaptation_are_those_of_its_seed(tiny_pearl: Make
         model.adapt(Watched(env), n_episodes=2, task=0, deterministic=False, seed=seed)
     np.testing.assert_array_equal(actions[0], actions[1])
     assert (np.array(actions[0]) != np.array(actions[2])).any()
+    # Nor are they the numbers that z is drawn by
+    with seeded_actions(3, deterministic=False):
+        assert not set(th.randn(20).tolist()) & set(th.randn(20, generator=th.Generator().manual_seed(3)).tolist())
     assert th.equal(state, th.get_rng_state())
 
 

@@ -34,6 +34,7 @@ def test_each_env_finishes_its_episodes_and_each_step_is_whole() -> None:
     lengths = (5, 3)
     env = DummyVecEnv([partial(gym.make, ENV_ID, max_episode_steps=length) for length in lengths])
     noting = Noting()
+    env.set_options({"task_id": 0})
     first = env.reset()
     assert isinstance(first, np.ndarray)
     steps = list(adaptation_steps(env, noting, 2, lambda actions: actions, noting.act, first))

@@ -120,6 +120,18 @@ def test_a_gradient_that_others_have_is_not_overwritten() -> None:
     assert th.equal(given, before)
 
 
+def test_an_output_may_be_overwritten_as_that_of_torch_may() -> None:
+    layers = nn.Sequential(nn.Linear(5, 8), nn.ELU(inplace=True), nn.Linear(8, 3))
+    x = th.randn(2 * MIN_ROWS, 5)
+    grads = []
+    for network in (copy.deepcopy(layers), with_fast_layers(copy.deepcopy(layers))):
+        y = network(x)
+        y += 1
+        y.square().sum().backward()
+        grads.append([parameter.grad for parameter in network.parameters()])
+    th.testing.assert_close(*grads, rtol=1e-4, atol=1e-4)
+
+
 def test_a_torch_without_the_private_operation_uses_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     assert find_onednn() is not None, "the tested version of torch has it"
     layer, x = Linear(64, 64), th.randn(1024, 64)

@@ -15,7 +15,7 @@ batches = st.lists(st.tuples(st.integers(1, 30), st.floats(-100, 100), st.floats
 @given(batches, st.integers(0, 99))
 def test_it_follows_what_was_observed_as_vec_normalize_does(batches: list[tuple[int, float, float]], seed: int) -> None:
     rng = np.random.default_rng(seed)
-    normalizer, theirs = ObservationNormalizer(3), RunningMeanStd(shape=(3,))
+    normalizer, theirs = ObservationNormalizer(3), RunningMeanStd(shape=(3,), epsilon=0.0)
     for n, mean, deviation in batches:
         obs = rng.normal(mean, deviation, (n, 3)).astype(np.float32)
         normalizer.update(obs)
@@ -39,6 +39,14 @@ def test_nothing_observed_changes_nothing_within_the_bounds_and_a_state_is_all_t
         one.update(np.ones((3, 2)))
     assert th.equal(normalizer(obs), other(obs))
     assert not list(normalizer.parameters()), "gradients have no say in it"
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e4, 1e6])
+def test_an_offset_is_no_deviation(offset: float) -> None:
+    normalizer, rng = ObservationNormalizer(1), np.random.default_rng(0)
+    obs = (offset + rng.standard_normal((4000, 1))).astype(np.float32)
+    normalizer.update(obs)
+    assert normalizer(th.from_numpy(obs)).std().item() == pytest.approx(1, rel=0.01)
 
 
 def test_a_large_rollout_is_not_rounded_away() -> None:

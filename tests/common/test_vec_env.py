@@ -47,6 +47,23 @@ def test_a_batch_has_the_attributes_of_single_envs() -> None:
         env.env_method("set_task", None, indices=[0])
 
 
+def test_an_observation_stays_what_it_was() -> None:
+    """Envs may write into one array at each step."""
+    batch = PointRobotVectorEnv(2)
+    buffer = np.zeros((2, 2), dtype=np.float32)
+    reset, step = batch.reset, batch.step
+
+    def written(result: Any) -> Any:
+        buffer[:] = result[0]
+        return buffer, *result[1:]
+
+    batch.reset = lambda **kwargs: written(reset(**kwargs))  # type: ignore[method-assign]
+    batch.step = lambda actions: written(step(actions))  # type: ignore[method-assign]
+    env = BatchedTaskVecEnv(batch)
+    seen = [env.reset(), *(env.step(np.ones((2, 2), dtype=np.float32))[0] for _ in range(2))]
+    assert [obs[0, 0].item() for obs in seen] == pytest.approx([0.0, 0.1, 0.2])  # type: ignore[index]
+
+
 def test_a_batch_is_as_single_envs_are_one_by_one() -> None:
     batch, single = (make_task_vec_env(ENV_ID, 2, vec_env_class=kind) for kind in (None, DummyVecEnv))
     for env in (batch, single):

@@ -115,19 +115,39 @@ class SilentReset(LineEnv):
         return super().reset(**kwargs)[0], {}
 
 
-@breaks("An observation is not in the observation space, or of its dtype")
+@breaks("An observation of a step is not in the observation space, or not of its dtype")
 class Float64Observation(LineEnv):
     def alter(self, observation: Any, *others: Any) -> Any:
         return observation.astype(np.float64), *others
 
 
-@breaks("An observation is not in the observation space, or of its dtype")
+@breaks("An observation of a step is not in the observation space, or not of its dtype")
 class ObservationOutOfSpace(LineEnv):
     def alter(self, observation: Any, *others: Any) -> Any:
         return observation + np.float32(9.0), *others
 
 
-@breaks("An observation has a number that is not finite")
+@breaks("An observation of a step has a number that is not finite")
+class NanObservation(LineEnv):
+    def alter(self, observation: Any, *others: Any) -> Any:
+        return np.full_like(observation, np.nan), *others
+
+
+@breaks("An observation of a reset has a number that is not finite")
+class NanAtReset(LineEnv):
+    def reset(self, **kwargs: Any) -> Any:
+        observation, info = super().reset(**kwargs)
+        return np.full_like(observation, np.nan), info
+
+
+@breaks("An observation of a reset is not in the observation space")
+class ResetOutOfSpace(LineEnv):
+    def reset(self, **kwargs: Any) -> Any:
+        observation, info = super().reset(**kwargs)
+        return observation + np.float32(9.0), info
+
+
+@breaks("An observation of a step has a number that is not finite")
 class InfiniteObservation(LineEnv):
     def __init__(self) -> None:
         super().__init__()
@@ -322,6 +342,14 @@ class PunishedFailure(LineFamily):
 class LeakingReward(LineFamily):
     def compute_reward(self, traj: Any, task: Any, *args: Any) -> Any:
         return super().compute_reward(traj, task, *args) - np.abs(np.asarray(task, dtype=np.float32))
+
+
+@breaks("which leaks the task, but 5e-05: compute_reward is what the task pays plus traj.task_free_reward")
+class InexactReward(LineFamily):
+    """More than rounding."""
+
+    def compute_reward(self, traj: Any, task: Any, *args: Any) -> Any:
+        return super().compute_reward(traj, task, *args) + np.float32(5e-5)
 
 
 @breaks("A step that solves its task exactly is worth no more than a failure")

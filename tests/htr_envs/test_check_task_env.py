@@ -49,6 +49,7 @@ WRITEABLE = np.ones((1, 1), dtype=np.float32)
 
 def test_an_env_without_tasks() -> None:
     assert_refused(gym.make("CartPole-v1"), "The env has no `task_family`")
+    assert_refused("SparsePointRobot-v0", "check_task_env takes one env: pass gymnasium.make(id)")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("name", ["compute_reward", "hindsight_task", "set_task", "test_tasks", "task_space"])
@@ -104,12 +105,35 @@ class Backwards(PointRobotDynamics):
         return super().step(-actions)
 
 
+class Entangled(PointRobotDynamics):
+    """All are pushed as the last one: alone, a copy is as it should be."""
+
+    def step(self, actions: Any) -> Any:
+        return super().step(np.broadcast_to(actions[-1], actions.shape))
+
+
+class NoisyBatch(DynamicsVectorEnv):
+    """Whose noise is drawn in another order than that of single envs, or in one that nobody looks at."""
+
+    def __init__(self, num_envs: int, max_episode_steps: int) -> None:
+        super().__init__(PointRobotFamily(), PointRobotDynamics(num_envs), max_episode_steps)
+
+    def step(self, actions: Any) -> Any:
+        self.np_random.normal()
+        return super().step(actions)
+
+
 BATCHES: dict[str, tuple[Any, str]] = {
     "of its own": (PointRobotVectorEnv, ""),
     "backwards": (
         lambda num_envs, max_episode_steps: DynamicsVectorEnv(PointRobotFamily(), Backwards(num_envs), max_episode_steps),
         "The batch of the id gives another episode than the env itself",
     ),
+    "mixed up": (
+        lambda num_envs, max_episode_steps: DynamicsVectorEnv(PointRobotFamily(), Entangled(num_envs), max_episode_steps),
+        "The batch of the id gives another episode than the env itself",
+    ),
+    "noisy": (NoisyBatch, ""),
     "with other tasks": (lambda **kwargs: PointRobotVectorEnv(**kwargs, task_seed=1), "Another env of the same id has other"),
     "that cannot be made": (
         lambda num_envs: None,

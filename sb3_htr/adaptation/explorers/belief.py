@@ -33,7 +33,7 @@ class Belief(ParticleExplorer):
     episode begins elsewhere each time, a z that was good may be a bad one: an episode that is not rewarded and whose value, as
     it goes on, is not what it was at the start, searches on to its end.
 
-    :param margin: a particle must promise so many times what the best episode returned, to be tried in its place; 0 or more
+    :param margin: a particle must promise so many times what the best episode returned, to be tried in its place; 1 or more
     :param kept: in [0, 1], when an episode with one z keeps its word: of what was found, the share that it must return to end
         the search; of what the critics promised at its start, the share that they must still promise as long as it is
         unrewarded. By measurement, docs/trials.md
@@ -45,7 +45,7 @@ class Belief(ParticleExplorer):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_numbers(margin=(self.margin, 0.0), kept=(self.kept, 0.0, 1.0))
+        check_numbers(margin=(self.margin, 1.0), kept=(self.kept, 0.0, 1.0))
 
     def start(self) -> None:
         super().start()
@@ -76,13 +76,20 @@ class Belief(ParticleExplorer):
 
     def final_z(self) -> np.ndarray:
         """
-        :return: (n_envs, latent_dim), z of the best episode of those with one z, or, where none of these was rewarded, the one
-            that was acted with last
+        :return: (n_envs, latent_dim), z of the best episode of those with one z, if it ended the search; else the one that
+            promises the largest return; where nothing was found, the one that was acted with last
         """
-        return np.where((self._best_z_return > 0)[:, None], self._best_z, self.z)
+        returns = self.weights(np.arange(len(self.z))) @ self.particles.returns.T
+        promising = self.particles.z[returns.argmax(dim=1)].cpu().numpy()
+        found = np.where(self._keeps_its_word()[:, None], self._best_z, promising)
+        return np.where(self.exploring()[:, None], self.z, found)
+
+    def _keeps_its_word(self) -> np.ndarray:
+        """(n_envs,) bool, whether an episode with one z has returned enough of what was found."""
+        return (self._best_z_return > 0) & (self._best_z_return >= self.kept * self._best_return)
 
     def look(self, obs: np.ndarray) -> None:
-        unsure = (self._best_z_return <= self.kept * self._best_return) & ~self._has_proposal
+        unsure = ~self._keeps_its_word() & ~self._has_proposal
         search = unsure & (self.exploring() | ~self._searching)
         self._searching = np.where(self._at_start, search, self._searching)
         due = self._at_start | (self._n_steps % self._every == 0)
