@@ -1,6 +1,7 @@
 """Evaluation during meta-training."""
 
 import os
+import time
 import warnings
 from collections.abc import Callable
 from typing import Any, cast
@@ -166,6 +167,9 @@ class MetaEvalCallback(EvalCallback):
         self.logger.record("eval/success_rate", float(successes[:, -1].mean()))
         self.logger.record("eval/episodes_to_first_success", float(first_success(successes).mean()))
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        # Within a rollout: what is logged around it is before and after many updates
+        seconds = (time.time_ns() - self.model.start_time) / 1e9
+        self.logger.record("time/time_elapsed", int(seconds), exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
         if self.verbose >= 1:
             print(

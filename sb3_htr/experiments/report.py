@@ -161,6 +161,9 @@ def write(command: str, experiment: Experiment, results: dict[Cell, Path], folde
     :raises ValueError: if a result lacks something; nothing is written then
     """
     check(results)
+    # Of what is finished, too, the first variant is what the others are compared with
+    variants = [variant.name or variant.method for variant in experiment.variants]
+    results = dict(sorted(results.items(), key=lambda result: variants.index(result[0].variant)))
     folder.mkdir(parents=True, exist_ok=True)
     # Of all methods together it may be some megabytes
     raw: dict[str, dict[str, Any]] = {}

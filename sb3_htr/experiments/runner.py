@@ -2,7 +2,6 @@
 
 import json
 import platform
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from sb3_htr.experiments.protocol import evaluate
 from sb3_htr.zoo.commands import train
 from sb3_htr.zoo.run.agents import RECORD, agent_at, file_stem, find_runs, n_steps_of, read_record
 from sb3_htr.zoo.run.algorithm import Model
-from sb3_htr.zoo.run.defaults import ALWAYS
+from sb3_htr.zoo.run.defaults import training_facts
 from sb3_htr.zoo.run.folder import SystemLock
 from sb3_htr.zoo.run.method import get_method, merged
 from sb3_htr.zoo.run.time_to_learned import seconds_at
@@ -135,7 +134,7 @@ def find_finished(cell: Cell, folder: Path) -> tuple[Path, Model] | None:
                     f"{run} has {key} {record[key]!r}, but {cell.experiment}/{cell.name} needs {getattr(cell, key)!r}: "
                     f"move this run away, or choose other --runs."
                 )
-        has, needs = (_settings(*of) for of in ((record["hyperparams"], record["arguments"]), _planned(cell, folder)))
+        has, needs = (training_facts(*of) for of in ((record["hyperparams"], record["arguments"]), _planned(cell, folder)))
         if different := sorted(key for key in {*has, *needs} if has.get(key) != needs.get(key)):
             key = different[0]
             raise ValueError(
@@ -156,10 +155,3 @@ def _planned(cell: Cell, folder: Path) -> tuple[dict[str, Any], list[str]]:
     of_env = {key: value for key, value in blocks.get(cell.env_id, blocks["default"]).items() if key != "method"}
     used = {**merged(method.settings(of_env), cell.settings), "n_timesteps": cell.n_timesteps}
     return json.loads(json.dumps(used, default=str)), cell.training(folder)
-
-
-def _settings(hyperparams: dict[str, Any], arguments: list[str]) -> dict[str, Any]:
-    """What a training is: hyperparameters, evaluations, and whether it began with the weights of another."""
-    options = {**ALWAYS, **dict(pairwise(arguments))}
-    chosen = {option: options.get(option) for option in ("--eval-episodes", "--eval-freq")}
-    return {**hyperparams, **chosen, "-i": options.get("-i", options.get("--trained-agent"))}

@@ -47,8 +47,8 @@ def check_reward_hook(
         i = int(worthless.argmax())
         raise ValueError(
             f"A step that does not solve its task, by is_success, returned {given[i]:.7g}, by compute_reward "
-            f"{computed[i]:.7g}, and its info['task_free_reward'] is {traj.task_free_reward[i, 0]:.7g}: they must be the same. "
-            "compute_reward is what the task pays plus traj.task_free_reward."
+            f"{computed[i]:.7g}, and its info['task_free_reward'] is {traj.task_free_reward[i, 0]:.7g}: they must be the "
+            "same. compute_reward is what the task pays plus traj.task_free_reward."
         )
     ended = rows[:, columns.done] > 0
     if is_relabelled and ended.any() and (ended == solved).all():

@@ -117,8 +117,8 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         buffer_class = replay_buffer_class or MultiTaskReplayBuffer
         if not issubclass(buffer_class, MultiTaskReplayBuffer):
             raise ValueError(
-                f"replay_buffer_class is {buffer_class.__name__}, expected MultiTaskReplayBuffer, which relabels by itself, or "
-                "a subclass of it: leave it out."
+                f"replay_buffer_class is {buffer_class.__name__}, expected MultiTaskReplayBuffer, which relabels by itself, "
+                "or a subclass of it: leave it out."
             )
         check_keywords("replay_buffer_kwargs", replay_buffer_kwargs or {}, buffer_class, without=GIVEN_BY_MODEL)
         if isinstance(env, str):

@@ -7,7 +7,7 @@ import torch as th
 from sb3_contrib import RecurrentPPO
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.adaptation import Step
@@ -146,11 +146,34 @@ class RL2(Rival, RecurrentPPO):
                 "an env of the same time limit, or make a new model."
             )
 
+    def learn(
+        self, total_timesteps: int, callback: MaybeCallback = None, log_interval: int | None = 1, *args: Any, **kwargs: Any
+    ) -> "RL2":
+        """
+        :param total_timesteps: env steps
+        :param callback: called at each step
+        :param log_interval: rollouts between two logs, None for no logs; those before a training was resumed count, too
+        :param args: see RecurrentPPO's
+        :param kwargs: likewise
+        :return: the model
+        :raises ValueError: for a log interval below 1
+        """
+        if log_interval is not None:
+            check_numbers(log_interval=(log_interval, 1))
+        self._log_interval = log_interval
+        super().learn(total_timesteps, callback, 1, *args, **kwargs)
+        return self
+
     def dump_logs(self, iteration: int = 0) -> None:
         """
         :param iteration: not used: rollouts are counted from the beginning of the training, which may have been resumed
         """
-        super().dump_logs(self.num_timesteps // (self.n_steps * self.n_envs))
+        n_rollouts = self.num_timesteps // (self.n_steps * self.n_envs)
+        if self._log_interval is not None and n_rollouts % self._log_interval == 0:
+            super().dump_logs(n_rollouts)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_log_interval"]
 
     def _adaptation(self, n_envs: int, generator: th.Generator | None) -> Adapting:
         return TrialAdaptation(self.policy, n_envs, self.n_episodes_per_trial)

@@ -34,7 +34,16 @@ def test_what_is_finished_of_an_experiment_is_reported_alone(
     experiment = EXPERIMENTS[name]
     finished = experiment.cells(3)[chosen]
     report.write("command", experiment, made_up(finished, tmp_path), tmp_path / "results")
-    rows = json.loads((tmp_path / "results" / "summary.json").read_text())["rows"]
+    summary = json.loads((tmp_path / "results" / "summary.json").read_text())
+    rows = summary["rows"]
+    # The first variant, also where its first run is not there yet
+    order = [variant.name or variant.method for variant in experiment.variants]
+    for env_kwargs in {str(cell.env_kwargs) for cell in finished}:
+        first = min((cell.variant for cell in finished if str(cell.env_kwargs) == env_kwargs), key=order.index)
+        others = [
+            row for kind in ("differences", "slowdowns") for row in summary[kind] if str(row["env_kwargs"]) == env_kwargs
+        ]
+        assert {row["of"] for row in others} <= {first}
     runs = Counter((cell.variant, str(cell.env_kwargs)) for cell in finished)
     assert {(row["variant"], str(row["env_kwargs"])): row["n_seeds"] for row in rows} == runs
     assert (tmp_path / "results" / f"{experiment.name}.png").exists()
@@ -102,6 +111,7 @@ def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monk
     if len({cell.variant for cell in cells}) > 1:
         few = tables.table({**summary, "rows": uneven})
         assert f"5 runs of {cells[0].variant}; 1 run of {cells[1].variant}" in few and few.count("fewer than the 5") == 1
+    assert "fewer than the 5" in tables.table({**summary, "rows": [{**summary["rows"][0], "n_seeds": n} for n in (1, 5)]})
     assert "commit abc, evaluated by def, " in tables.table({**summary, "evaluation_commit": "def"})
     headline = tables.headline({name: summary}).splitlines()[2:]
     shown = [cell for cell in variants.values() if cell.variant in tables.HEADLINE.get(name, ())]

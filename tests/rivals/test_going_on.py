@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.logger import Logger
 
 from helpers import ENV_ID
 from sb3_htr.common.vec_env import make_task_vec_env
@@ -45,6 +46,18 @@ def test_it_goes_on_exactly(make: Callable[[], Any]) -> None:
     assert second.num_timesteps == unbroken.num_timesteps and second._n_updates == unbroken._n_updates
     for name, value in unbroken.policy.state_dict().items():
         assert th.equal(value, second.policy.state_dict()[name]), name
+
+
+@pytest.mark.parametrize("make", [rl2, sac_her])
+def test_it_logs_the_rollouts_that_it_would_have_logged(make: Callable[[], Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    logged: list[int] = []
+    monkeypatch.setattr(Logger, "dump", lambda logger, step=0: logged.append(step))
+    for parts in ((6,), (2, 4)):
+        logged.append(0)
+        model = make()
+        for i, n_rollouts in enumerate(parts):
+            model.learn(n_rollouts * ROLLOUT, log_interval=3, reset_num_timesteps=i == 0)
+    assert logged == [0, 3 * ROLLOUT, 6 * ROLLOUT] * 2
 
 
 @pytest.mark.parametrize("make", [rl2, sac_her])

@@ -252,14 +252,22 @@ def test_an_explorer_named_by_its_record_is_the_agents_own(explorer: Any, tmp_pa
 
 @pytest.mark.parametrize("defaults", [["--save-freq", "20000"], ["--save-freq", "20000", "--eval-episodes", "20"]])
 def test_the_command_of_a_record_is_that_of_any_machine(defaults: list[str]) -> None:
-    """What the trained agent was trained by, without local folders, and with the seed that was drawn."""
+    """What the trained agent was trained by, without local folders and settings, and with the seed that was drawn."""
     arguments = ["--algo", "pearl", "-conf", "/home/me/pearl.yml", "--num-threads", "1", *defaults]
     study = ["--storage", "postgresql://me:secret@db/x", "--study-name=x", "--trial-id", "7", "--tensorboard-log=/home/me/tb"]
     arguments += [*study, "-conf", "/home/me/my.yml", "-i", "/home/me/agent.zip"]
     arguments += ["--env", ENV_ID, "-f", "/home/me/runs", "-P", "--seed", "3", "-params", "policy_kwargs:{'latent_dim': 3}"]
     command = model_card.training_command({"arguments": arguments, "seed": 4, "method": "htr-ec"})
     params = "-params 'policy_kwargs:{'\"'\"'latent_dim'\"'\"': 3}'"
-    assert command == f"sb3-htr train --env {ENV_ID} {params} --method htr-ec --seed 4"
+    assert command == f"sb3-htr train -i agent.zip --env {ENV_ID} {params} --method htr-ec --seed 4"
+
+
+@pytest.mark.parametrize("file", ["pearl_prior.yml", "hyperparams/pearl_prior.yml"])
+@pytest.mark.parametrize("option", ["-conf", "--conf-file"])
+def test_the_command_of_a_record_names_settings_that_everybody_has(file: str, option: str) -> None:
+    arguments = ["--env", ENV_ID, option, file]
+    command = model_card.training_command({"arguments": arguments, "seed": 4, "method": "htr-ser-prior"})
+    assert command == f"sb3-htr train --env {ENV_ID} {option} pearl_prior.yml --method htr-ser-prior --seed 4"
 
 
 @pytest.mark.parametrize(

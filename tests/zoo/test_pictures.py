@@ -2,6 +2,7 @@
 
 import warnings
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import matplotlib.pyplot as plt
@@ -19,6 +20,7 @@ from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.commands.plot import check_same_settings
 from sb3_htr.zoo.plots import adaptation, curves, style
 from sb3_htr.zoo.plots.style import curve_colours, curve_styles
+from sb3_htr.zoo.run.agents import TrainedAgent
 from sb3_htr.zoo.run.method import methods
 
 
@@ -152,6 +154,26 @@ def test_plot_draws_seeds_as_one_curve(
         make_run(folders[0], tiny_pearl(), 3, hyperparams={"explorer": {"name": "belief"}, "gamma": 0.5})
         main(["plot", *arguments])
     check_same_settings("none", [])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "different"),
+    [
+        (["-i", "agent.zip"], "-i"),
+        (["--trained-agent=agent.zip"], "-i"),
+        (["--eval-env-kwargs", "goal_distance:0.2", "goal_radius:1"], "--eval-env-kwargs"),
+        (["--eval-episodes", "3"], "--eval-episodes"),
+        (["--eval-episodes", "20", "--eval-freq", "-1"], None),
+    ],
+)
+def test_runs_on_one_curve_began_and_were_evaluated_alike(arguments: list[str], different: str | None) -> None:
+    record: dict[str, Any] = {"hyperparams": {}, "env_kwargs": {}}
+    runs = [TrainedAgent(Path("a"), {**record, "arguments": more}, None) for more in ([], arguments)]
+    if different is None:
+        check_same_settings("one", runs)
+        return
+    with pytest.raises(ValueError, match=rf"The runs in one differ in \['{different}'\]"):
+        check_same_settings("one", runs)
 
 
 def test_plot_says_what_is_missing_in_a_curve(

@@ -20,6 +20,7 @@ from sb3_htr.zoo.plots.adaptation import plot_adaptation_curve, plot_adaptation_
 from sb3_htr.zoo.plots.curves import Curve, plot_curves
 from sb3_htr.zoo.plots.latent import plot_latent_space
 from sb3_htr.zoo.run.agents import RECORD, TrainedAgent, runs_with_models
+from sb3_htr.zoo.run.defaults import training_facts
 from sb3_htr.zoo.run.time_to_learned import time_to_learned
 
 EXAMPLE = """  sb3-htr plot --env SparsePointRobot-v0                  an agent that comes with the package
@@ -127,8 +128,11 @@ def check_same_settings(label: str, agents: Sequence[TrainedAgent]) -> None:
     :param agents: runs that should differ in their seed alone
     :raises ValueError: if they differ in anything else
     """
-    settings = [{**agent.record.get("hyperparams", {}), "env_kwargs": agent.record["env_kwargs"]} for agent in agents]
+    records = [agent.record for agent in agents]
+    facts = [training_facts(record.get("hyperparams", {}), record.get("arguments", ())) for record in records]
+    settings = [{**of, "env_kwargs": record["env_kwargs"]} for of, record in zip(facts, records, strict=True)]
     different = {key for other in settings for key in {*settings[0], *other} if settings[0].get(key) != other.get(key)}
+    different.discard("--eval-freq")  # a curve is of the evaluations that all have
     if different:
         raise ValueError(
             f"The runs in {label} differ in {sorted(different)}: put them into folders of their own, one per curve."

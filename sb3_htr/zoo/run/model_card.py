@@ -1,6 +1,7 @@
 """The page that goes with a shared agent."""
 
 import shlex
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -11,6 +12,7 @@ from sb3_htr.zoo.run.algorithm import Algorithm
 from sb3_htr.zoo.run.defaults import given_arguments
 from sb3_htr.zoo.run.hub import model_name
 from sb3_htr.zoo.run.method import DEFAULT, PEARLMethod, get_method, methods
+from sb3_htr.zoo.run.shipped import hyperparams_file
 from sb3_htr.zoo.run.trust import PACKAGES
 
 TAGS = (
@@ -26,15 +28,17 @@ PEARL = "PEARL (Rakelly et al., 2019)"
 OF_EXPLORERS = """ The explorer says how z is chosen;
 `prior` is the protocol of PEARL's paper."""
 # Arguments of a training that change nothing of its result, or name what is on one machine alone, with the number of their
-# values. What a study or a file of settings brought is among the hyperparameters of the card
+# values. What a study brought is among the hyperparameters of the card
 LOCAL = {"-f": 1, "--log-folder": 1, "-tb": 1, "--tensorboard-log": 1, "-P": 0, "--progress": 0, "--verbose": 1, "--seed": 1}
-LOCAL |= dict.fromkeys(("--storage", "--study-name", "--trial-id", "-conf", "--conf-file", "-i", "--trained-agent"), 1)
+LOCAL |= dict.fromkeys(("--storage", "--study-name", "--trial-id"), 1)
+# Files: of settings, which others have if they come with the package, and of the weights that it began with
+SETTINGS, WEIGHTS = ("-conf", "--conf-file"), ("-i", "--trained-agent")
 
 
 def training_command(record: dict[str, Any]) -> str:
     """
     :param record: of a run
-    :return: the command that trains the same agent on another machine
+    :return: the command that trains the same agent on another machine; of files it has the names alone
     """
     if "arguments" not in record:
         return str(record.get("command", "unknown"))
@@ -42,9 +46,13 @@ def training_command(record: dict[str, Any]) -> str:
     words: list[str] = []
     while arguments:
         word = arguments.pop(0)
-        option, equals, _ = word.partition("=")
+        option, equals, value = word.partition("=")
         if option in LOCAL:
             del arguments[: 0 if equals else LOCAL[option]]
+        elif option in (*SETTINGS, *WEIGHTS):
+            file = Path(value if equals else arguments.pop(0))
+            if option in WEIGHTS or (file.parent.name in ("", "hyperparams") and hyperparams_file(file.name).is_file()):
+                words += [option, file.name]
         else:
             words.append(word)
     return shlex.join(["sb3-htr", "train", *words, "--seed", str(record["seed"])])

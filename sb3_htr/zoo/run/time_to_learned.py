@@ -35,8 +35,8 @@ def seconds_at(log: Path, steps: np.ndarray) -> np.ndarray:
     """
     :param log: ``progress.csv`` of a training
     :param steps: (n,) env steps
-    :return: (n,) seconds of training until then, between the rollouts that were logged around it; what was trained after a
-        checkpoint and lost does not count. NaN where nothing tells them
+    :return: (n,) seconds of training until then, as logged; of older runs, between the rollouts that were logged around it.
+        What was trained after a checkpoint and lost does not count. NaN where nothing tells them
     """
     if not log.exists():
         return np.full(len(steps), np.nan)
