@@ -2,8 +2,8 @@
 
     python examples/walker_random_params.py      # meta-train by plain PEARL and adapt; hours on one core
 
-PEARL's walker-rand-params. The reward is the same in all tasks, and old experience says nothing about another body: there is
-nothing to relabel.
+PEARL's walker-rand-params, but for the walker, which is gymnasium's: it acts every four physics steps, theirs every five. The
+reward is the same in all tasks, and old experience says nothing about another body: there is nothing to relabel.
 """
 
 from typing import Any, ClassVar
@@ -18,9 +18,9 @@ from htr_envs import MetaEnv, TaskDistribution
 from htr_envs.headless import open_no_window
 from htr_envs.task_env import FloatArray
 
-# Arrays of MuJoCo's model, each number of which is multiplied by BASE to the power of one number of the task
-PARAMETERS = ("body_mass", "body_inertia", "dof_damping", "geom_friction")
-BASE, LIMIT = 1.5, 3.0
+# Arrays of MuJoCo's model, and the base that to the power of one number of the task multiplies each of their numbers
+PARAMETERS = {"body_mass": 1.5, "body_inertia": 1.5, "dof_damping": 1.3, "geom_friction": 1.5}
+LIMIT = 3.0
 
 
 class ScaleDistribution(TaskDistribution):
@@ -61,10 +61,11 @@ class WalkerRandomParamsEnv(MetaEnv):
         self.action_space = self.walker.action_space
 
     def _reset_state(self) -> FloatArray:
-        scale = BASE ** self.task.astype(np.float64)
+        exponents = self.task.astype(np.float64)
         for name, values in self.original.items():
-            getattr(self.walker.model, name)[:] = values * scale[: values.size].reshape(values.shape)
-            scale = scale[values.size :]
+            scale = PARAMETERS[name] ** exponents[: values.size]
+            getattr(self.walker.model, name)[:] = values * scale.reshape(values.shape)
+            exponents = exponents[values.size :]
         mujoco.mj_setConst(self.walker.model, self.walker.data)
         obs, _ = self.walker.reset(seed=int(self.np_random.integers(2**31)))
         return obs

@@ -188,8 +188,8 @@ class AntEnv(DynamicsEnv):
     uniformly and in balance: one from each of as many equal sectors. `task_space` is a square that no ant leaves within 200
     steps, because a hindsight task is any position that the ant reached.
 
-    The distance 2, the angles and the 200 steps are MAESN's. The numbers of tasks and their split are those of PEARL's point
-    robot, the validation tasks are our choice. A control step is 0.05 s, as in PEARL's ants: MAESN's 0.01 s leave 2 seconds to
+    The distance 2, the angles and the 200 steps are MAESN's. The training tasks have the angles of PEARL's point robot, the
+    validation and test tasks are our choice. A control step is 0.05 s, as in PEARL's ants: MAESN's 0.01 s leave 2 seconds to
     walk 2 metres. Because random actions lead further then, the radius is 0.4 here, where MAESN has 0.8: our choice.
 
     A uniformly random policy reaches the goal in 0.04 % of its episodes (13 of 30,000 measured; a radius of 0.5 would make it

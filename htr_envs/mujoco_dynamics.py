@@ -31,8 +31,10 @@ DoubleArray = NDArray[np.float64]
 
 FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 FRAME_WIDTH, FRAME_HEIGHT = 640, 400
-# From behind the start, looking down on the semicircle of goals
-CAMERA = {"lookat": np.array([0.0, 0.9, 0.0]), "distance": 4.8, "azimuth": 90.0, "elevation": -45.0}
+# From behind the start, looking down on all goals
+AZIMUTH, ELEVATION = 90.0, -45.0
+# How far away, as multiples of the width and the depth of where they are
+DISTANCE = np.array([1.2, 1.45])
 # Threads of a process that this one was forked from
 LOST: list[Any] = []
 
@@ -143,7 +145,11 @@ class MujocoDynamics(Dynamics[PositionGoalFamily]):
             open_no_window(render_mode)
             self.model.geom("goal").size[0] = task_family.goal_radius
             data = mujoco.MjData(self.model)  # of its own: a picture changes nothing in the simulation
-            self._renderer = MujocoRenderer(self.model, data, dict(CAMERA), FRAME_WIDTH, FRAME_HEIGHT, camera_id=-1), data
+            goals = np.concatenate([task_family.train_tasks, task_family.validation_tasks, task_family.test_tasks])
+            low, high = goals.min(axis=0), goals.max(axis=0)
+            camera = {"lookat": np.array([*(low + high) / 2, 0.0]), "distance": (DISTANCE * (high - low)).max()}
+            camera |= {"azimuth": AZIMUTH, "elevation": ELEVATION}
+            self._renderer = MujocoRenderer(self.model, data, camera, FRAME_WIDTH, FRAME_HEIGHT, camera_id=-1), data
         renderer, data = self._renderer
         mujoco.mj_setState(self.model, data, path[-1], FULL_PHYSICS)
         data.mocap_pos[0, :2] = task

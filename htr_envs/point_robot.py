@@ -19,7 +19,7 @@ STEP_SIZE = np.float32(0.1)
 class PointRobotFamily(SemicircleGoalFamily):
     """Goals on a semicircle, worth 1 minus the distance within the goal radius and 0 outside.
 
-    With the default arguments the goals and their split are those of PEARL's reference implementation.
+    With the default arguments the training goals are those of PEARL's reference implementation.
 
     :param goal_distance: distance of the goals from the start, at most 10.
     :param goal_radius: a goal is reached where the distance to it is smaller than this, at most 1.
@@ -113,9 +113,9 @@ class PointRobotEnv(DynamicsEnv):
     uniformly and in balance: one from each of as many equal sectors. `task_space` is the whole arena, because a hindsight task
     is any position that the robot reached.
 
-    The paper gives the two rewards and the radius 0.2. It does not give the goal distance, the number of tasks, their split,
-    the episode length and the step size: those are PEARL's values, taken from its reference implementation. The validation
-    tasks and the walls at +-10 are our choice.
+    The paper gives the two rewards and the radius 0.2. It does not give the goal distance, the training tasks, the episode
+    length and the step size: those are PEARL's, taken from its reference implementation, which tests on the 20 other angles.
+    The validation and test tasks and the walls at +-10 are our choice.
 
     A uniformly random policy reaches the goal in 0.05 % of its episodes (501 of 1,000,000 measured), and more distant goals
     more rarely still.

@@ -79,7 +79,7 @@ class WheeledEnv(DynamicsEnv):
 
     The model is our own: a chassis of 2 kg with a wheel of radius 0.1 m on either side, 0.3 m apart. It slides along x, y and
     z and turns about z, but never tips over. Only the friction of the wheels on the floor moves it, and it slips where the
-    motors ask for more. Wheels at full power accelerate it by 13 m/s² up to 5.3 m/s, or turn it by 90° within 0.16 s.
+    motors ask for more. Wheels at full power accelerate it by 13 m/s² up to 5.3 m/s, or turn it by 90° within 0.17 s.
 
     ## Action Space
 
@@ -131,8 +131,8 @@ class WheeledEnv(DynamicsEnv):
     uniformly and in balance: one from each of as many equal sectors. `task_space` is a square that no robot leaves within 200
     steps, because a hindsight task is any position that the robot reached.
 
-    The distance 2, the angles and the 200 steps of 0.01 s are MAESN's. The numbers of tasks and their split are those of
-    PEARL's point robot, the validation tasks are our choice. So is the radius 0.5, where MAESN has 0.8: a larger disc makes
+    The distance 2, the angles and the 200 steps of 0.01 s are MAESN's. The training tasks have the angles of
+    PEARL's point robot, the validation and test tasks are our choice. So is the radius 0.5, where MAESN has 0.8: a larger disc makes
     tasks overlap more, and more hindsight tasks contain the start, which are solved without moving.
 
     A uniformly random policy never reached its goal in 200,000 episodes that were measured. It gets 0.23 m away from the

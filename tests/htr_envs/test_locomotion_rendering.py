@@ -45,6 +45,14 @@ def test_the_picture_shows_the_goal_of_the_episode(env_id: str) -> None:
     smaller.close()
 
 
+def test_goals_are_in_the_picture_however_far_away_they_are() -> None:
+    _, far = make("SparseWheeled-v0", render_mode="rgb_array", goal_distance=5.0)
+    for goal in ([-5.0, 0.0], [0.0, 5.0], [5.0, 0.0]):
+        far.reset(seed=0, options={"task": goal})
+        assert len(goal_pixels(picture(far))) > 300
+    far.close()
+
+
 @both_envs
 def test_rendering_changes_nothing(env_id: str) -> None:
     (seen, base), (unseen, _) = make(env_id, render_mode="rgb_array"), make(env_id)
