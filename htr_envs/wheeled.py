@@ -132,8 +132,8 @@ class WheeledEnv(DynamicsEnv):
     steps, because a hindsight task is any position that the robot reached.
 
     The distance 2, the angles and the 200 steps of 0.01 s are MAESN's. The training tasks have the angles of
-    PEARL's point robot, the validation and test tasks are our choice. So is the radius 0.5, where MAESN has 0.8: a larger disc makes
-    tasks overlap more, and more hindsight tasks contain the start, which are solved without moving.
+    PEARL's point robot, the validation and test tasks are our choice. So is the radius 0.5, where MAESN has 0.8: a larger
+    disc makes tasks overlap more, and more hindsight tasks contain the start, which are solved without moving.
 
     A uniformly random policy never reached its goal in 200,000 episodes that were measured. It gets 0.23 m away from the
     start on average, 0.46 m in one episode of 20, 1.18 m in the best. A simple feedback controller that knows the goal is

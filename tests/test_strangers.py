@@ -25,7 +25,8 @@ from sb3_htr.common.plain import load_plain
 from sb3_htr.common.resume import checkpoints
 from sb3_htr.zoo.cli import console, main
 from sb3_htr.zoo.commands.optimize import create_study
-from sb3_htr.zoo.run.agents import RECORD, agent_at
+from sb3_htr.zoo.run.agents import RECORD, agent_at, find_runs
+from sb3_htr.zoo.run.callbacks import ProgressCallback
 from sb3_htr.zoo.run.trust import check_arguments, plain_settings
 
 
@@ -56,7 +57,8 @@ RECORDS: dict[str, Callable[[str], dict[str, Any]]] = {
     "an abbreviated option with one dash": lambda code: {"arguments": ["-par", f"gamma:{code}"]},
     "an option and its value in one word": lambda code: {"arguments": [f"--hyperparams=gamma:{code}"]},
     "its settings are a module": lambda code: {"arguments": ["-conf", "evil"]},
-    "a model to begin with": lambda code: {"arguments": ["-i", "evil.zip"]},
+    "its settings are a module that looks like a file": lambda code: {"arguments": ["-conf", "evil.yml/"]},
+    "a model to begin with that there is not": lambda code: {"arguments": ["-i", "evil.zip"]},
     "an env within the arguments": lambda code: {"arguments": ["--env-kwargs", "env_id:'evil:Env-v0'"]},
     "an upload": lambda code: {"arguments": ["--track"]},
     "a search": lambda code: {"arguments": ["-optimize"]},
@@ -276,6 +278,9 @@ def test_a_model_to_begin_with(fuse: Path, tmp_path: Path, tiny_pearl: MakePEARL
     assert not fuse.exists()
     trained, given = agent_at(tmp_path / "logs", "last").load().policy.state_dict(), model.policy.state_dict()
     assert all(th.equal(trained[name], given[name]) for name in given if not name.startswith("normalizer"))
+    # A run goes on as it began
+    (run,) = find_runs(tmp_path / "logs")
+    assert main(["train", "--resume", str(run), "-n", "240"]) == 0 and not fuse.exists()
     with pytest.raises(ValueError, match="is unpickled to be trained on, which can run any code: add --trust"):
         main(["train", "--method", "sac-her", "-i", str(hostile), "-f", str(tmp_path / "logs"), *arguments[:-1]])
 
@@ -287,11 +292,30 @@ def test_calls_that_take_memory(tmp_path: Path) -> None:
         def __reduce__(self) -> Any:
             return bytearray, (10**6,)
 
-    with zipfile.ZipFile(tmp_path / "large.pt", "w") as archive:
-        archive.writestr("archive/data.pkl", pickle.dumps({"x": Large()}, protocol=2))
-        archive.writestr("archive/version", "3")
-    with pytest.raises(ValueError, match="it calls what no tensor needs"):
+    for name in ("data.pkl", "DATA.PKL"):
+        with zipfile.ZipFile(tmp_path / "large.pt", "w") as archive:
+            archive.writestr(f"archive/{name}", pickle.dumps({"x": Large()}, protocol=2))
+            archive.writestr("archive/version", "3")
+        with pytest.raises(ValueError, match="it calls what no tensor needs"):
+            load_plain(tmp_path / "large.pt")
+    # Something that torch reads, and behind it a zip that is harmless
+    harmless = io.BytesIO()
+    th.save({"x": th.zeros(1)}, harmless)
+    th.save({"x": Large()}, tmp_path / "large.pt", _use_new_zipfile_serialization=False)
+    with (tmp_path / "large.pt").open("ab") as file:
+        file.write(harmless.getvalue())
+    with pytest.raises(ValueError, match="it does not begin as a file of torch"):
         load_plain(tmp_path / "large.pt")
+
+
+def test_a_link_in_the_place_of_a_file_of_a_run(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    """A checkpoint says what is written there."""
+    (tmp_path / "mine").write_text("mine")
+    (tmp_path / "progress.csv").symlink_to("mine")
+    progress = ProgressCallback(tmp_path / "progress.csv")
+    progress.load_state_dict({"keys": [], "text": "code"})
+    tiny_pearl().learn(1, progress)
+    assert (tmp_path / "mine").read_text() == "mine" and not (tmp_path / "progress.csv").is_symlink()
 
 
 def test_modules_of_the_working_folder_wait_for_the_user(

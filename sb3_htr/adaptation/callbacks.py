@@ -15,6 +15,7 @@ from sb3_htr.adaptation.evaluation import MetaLearner, first_success, record_ada
 from sb3_htr.adaptation.explorers import to_explorer
 from sb3_htr.common.atomic import WRITE_ERRORS, atomic_path, reason
 from sb3_htr.common.checks import get_task_family
+from sb3_htr.common.resume import numbers_of
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
 
@@ -66,10 +67,7 @@ class MetaEvalCallback(EvalCallback):
             "returns": [th.from_numpy(returns) for returns in self.returns],
             "successes": [th.from_numpy(successes) for successes in self.successes],
             "best_mean_reward": float(self.best_mean_reward),
-            "children": [
-                {name: value for name, value in vars(child).items() if type(value) in (bool, int, float)}
-                for child in self._children()
-            ],
+            "children": [numbers_of(child) for child in self._children()],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

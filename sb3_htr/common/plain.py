@@ -51,12 +51,17 @@ def load_plain(file: str | os.PathLike[str] | IO[bytes]) -> Any:
     :raises Exception: of many kinds, for a file that is damaged or of another kind
     """
     with zipfile.ZipFile(file) as archive:
+        assert archive.fp is not None
+        archive.fp.seek(0)
+        # A zip may have something before it, which torch would read in its place
+        if archive.fp.read(4) != b"PK\x03\x04":
+            raise Refused("it does not begin as a file of torch.")
         size = _check_size(archive)
         # torch does not look at the checksums
         if archive.testzip() is not None:
             raise Refused("it is not what was written.")
         for name in archive.namelist():
-            if name.endswith("data.pkl"):
+            if name.lower().endswith("data.pkl"):  # torch finds it in any case
                 _check_pickle(archive.read(name))
     if not isinstance(file, str | os.PathLike):
         file.seek(0)

@@ -1,6 +1,7 @@
 """Checkpoints from which a training goes on as if it had never stopped."""
 
 import io
+import re
 import shutil
 import time
 import warnings
@@ -47,6 +48,14 @@ def _n_steps(checkpoint: Path) -> int:
     return int(checkpoint.name.removesuffix("_steps"))
 
 
+def numbers_of(callback: BaseCallback) -> dict[str, Any]:
+    """
+    :param callback: that has no state of its own to tell, as SB3's have none
+    :return: its numbers, counts among them
+    """
+    return {name: value for name, value in vars(callback).items() if type(value) in (bool, int, float)}
+
+
 def n_steps_done(run: Path) -> int:
     """
     :param run: folder of a run
@@ -80,14 +89,16 @@ def cut_monitor_files(run: Path, folder: Path, sizes: dict[str, int]) -> None:
     :param sizes: of the monitor files when it was made
     """
     kept = f".until_{folder.name}.monitor.csv"
-    for path in run.glob("*.monitor.csv"):
+    # What was cut before comes first: it may be of a later checkpoint, and begins with what this one had
+    for path in sorted(run.glob("*.monitor.csv"), key=lambda path: len(path.name), reverse=True):
         if path.name.endswith(kept) or (".until_" in path.name and path.name in sizes):
             continue
-        target = path.with_name(path.name.removesuffix(".monitor.csv") + kept)
+        name = path.name if path.name in sizes else re.sub(r"\.until_\d+_steps(?=\.monitor\.csv$)", "", path.name)
+        target = path.with_name(name.removesuffix(".monitor.csv") + kept)
         # If it exists, this training has gone on from here before, and what is cut is already there
-        if path.name in sizes and not target.exists():
+        if name in sizes and not target.exists():
             with atomic_path(target) as temporary:
-                temporary.write_bytes(path.read_bytes()[: sizes[path.name]])
+                temporary.write_bytes(path.read_bytes()[: sizes[name]])
         path.unlink()
 
 
@@ -145,6 +156,8 @@ class CheckpointCallback(BaseCallback):
             callback.n_calls = remembered["n_calls"]
             if isinstance(callback, HasState):
                 callback.load_state_dict(remembered["state"])
+            elif callback is not self:
+                vars(callback).update(remembered["state"] or {})  # older checkpoints have none
         self._last_calls = self.n_calls
         # Setting up the training makes a logger
         self._pending = state
@@ -257,7 +270,7 @@ class CheckpointCallback(BaseCallback):
     def _callback_states(self) -> list[dict[str, Any]]:
         states = []
         for callback in (self, *self.companions):
-            state = callback.state_dict() if isinstance(callback, HasState) else None
+            state = callback.state_dict() if isinstance(callback, HasState) else numbers_of(callback)
             file = io.BytesIO()
             try:
                 th.save(state, file)

@@ -7,7 +7,7 @@ import gymnasium as gym
 import matplotlib.figure
 import numpy as np
 import pytest
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.logger import Figure, HParam
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -76,6 +76,20 @@ def test_a_training_goes_on_with_as_many_envs(tiny_pearl: MakePEARL, tmp_path: P
     callback.restore(model, load_latest(tmp_path)[1])
     with pytest.raises(ValueError, match="The training had 4 envs, and goes on with 2"):
         model.learn(ROLLOUT, callback, reset_num_timesteps=False)
+
+
+def test_counts_of_callbacks_of_others_go_on(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    """SB3's have no state that they would tell."""
+    stopped_at = []
+    for parts in ((5,), (2, 3)):
+        for i, n_rollouts in enumerate(parts):
+            model, stop = tiny_pearl(), StopTrainingOnMaxEpisodes(max_episodes=11)
+            callback = CheckpointCallback(1, str(tmp_path / str(parts)), companions=[stop])
+            if i > 0:
+                callback.restore(model, load_latest(tmp_path / str(parts))[1])
+            model.learn(n_rollouts * ROLLOUT, [callback, stop], reset_num_timesteps=i == 0)
+        stopped_at.append(model.num_timesteps)
+    assert stopped_at[0] == stopped_at[1] < 5 * ROLLOUT
 
 
 def test_some_checkpoints_are_kept() -> None:

@@ -1,5 +1,6 @@
 """A disk that fills up ends no training, and what was lost for want of it comes back."""
 
+import errno
 import subprocess
 import warnings
 from collections.abc import Callable
@@ -87,6 +88,31 @@ def test_a_monitor_file_without_room_ends_no_training(tmp_path: Path) -> None:
         env.close()
         assert model.num_timesteps == 1600
         assert len(load_results(str(folder))) > 100
+
+
+def test_tensorboard_without_room_ends_no_training(
+    tiny_pearl: MakePEARL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its writer repeats an error for ever."""
+    tensorboard = pytest.importorskip("torch.utils.tensorboard")
+    flush = tensorboard.SummaryWriter.flush
+    broken: list[object] = []
+
+    def fill_up(writer: object) -> None:
+        if not broken:
+            broken.append(writer)
+        if writer in broken:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        flush(writer)
+
+    monkeypatch.setattr(tensorboard.SummaryWriter, "flush", fill_up)
+    model = tiny_pearl(tensorboard_log=str(tmp_path / "tb"))
+    with pytest.warns(
+        UserWarning, match=r"TensorBoard's .*tb.* could not be written \(No space .*\)\. Training goes on"
+    ) as said:
+        model.learn(3 * ROLLOUT, ProgressCallback(tmp_path / "progress.csv"))
+    assert len([warning for warning in said if "TensorBoard's" in str(warning.message)]) == 1
+    assert model.num_timesteps == 3 * ROLLOUT and len([*(tmp_path / "tb").rglob("events*")]) == 2
 
 
 def test_a_lost_progress_file_is_written_anew(tiny_pearl: MakePEARL, tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from helpers import parameters as model_parameters
 from helpers.runs import run_folder
 from sb3_htr import PEARL
 from sb3_htr.common.checkpoint import write_checkpoint
-from sb3_htr.common.resume import checkpoints
+from sb3_htr.common.resume import checkpoints, cut_monitor_files
 from sb3_htr.common.versions import named
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run.manager import MetaExperimentManager
@@ -101,6 +101,27 @@ def test_a_finished_run_says_so(unbroken: Path, capsys: pytest.CaptureFixture[st
     assert main(["train", "--resume", str(unbroken)]) == 0
     assert f"{unbroken} is finished, after 2,400 env steps" in capsys.readouterr().out
     assert before == {path: path.stat().st_mtime_ns for path in unbroken.rglob("*")}
+
+
+def test_a_finished_run_without_its_checkpoints_says_so(
+    unbroken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = run_folder(tmp_path)
+    shutil.copytree(unbroken, run)
+    shutil.rmtree(run / "checkpoints")
+    assert main(["train", "--resume", str(run)]) == 0
+    assert f"{run} is finished, after 2,400 env steps. Its checkpoints were removed" in capsys.readouterr().out
+
+
+def test_an_older_checkpoint_has_its_own_episodes(tmp_path: Path) -> None:
+    """It went on from a later one, which was found damaged afterwards."""
+    path = tmp_path / "0.monitor.csv"
+    path.write_text("123456789")
+    cut_monitor_files(tmp_path, Path("480_steps"), {path.name: 6})
+    path.write_text("abcdefghi")
+    cut_monitor_files(tmp_path, Path("240_steps"), {path.name: 3})
+    (kept,) = tmp_path.iterdir()
+    assert (kept.name, kept.read_text()) == ("0.until_240_steps.monitor.csv", "123")
 
 
 def test_a_run_whose_model_could_not_be_written_is_not_finished(unbroken: Path, tmp_path: Path) -> None:

@@ -9,9 +9,11 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any, cast
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
+from gymnasium.envs.registration import EnvSpec
 
 import sb3_htr
 from helpers import ENV_ID, TINY
@@ -72,6 +74,14 @@ def test_a_model_is_trained_on(runs: Path, capsys: pytest.CaptureFixture[str]) -
     model = run_folder(runs) / f"{ENV_ID}.zip"
     assert main(train_arguments(runs / "more", 240, "-i", str(model))) == 0
     assert "Loading pretrained agent" in capsys.readouterr().out
+
+
+def test_an_id_may_have_a_dot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is behind it is no suffix of a file."""
+    monkeypatch.setitem(gym.registry, "Robot1.5-v0", EnvSpec("Robot1.5-v0", "htr_envs:PointRobotEnv", max_episode_steps=20))
+    arguments = [word if word != ENV_ID else "Robot1.5-v0" for word in train_arguments(tmp_path, 240)]
+    assert main(arguments) == 0
+    assert main(["evaluate", str(tmp_path), "--n-episodes", "1"]) == 0
 
 
 def test_normalized_runs_are_evaluated_as_they_were_trained(tmp_path: Path) -> None:

@@ -13,15 +13,15 @@ import gymnasium as gym
 from htr_envs.goal_env import find_hidden
 from sb3_htr.common.resume import n_steps_done
 from sb3_htr.zoo.run.agents import OF_TRAINING, RECORD, file_stem, find_run, n_steps_of, read_record
-from sb3_htr.zoo.run.defaults import default_arguments, given_arguments
+from sb3_htr.zoo.run.defaults import default_arguments, given_arguments, value_of
 from sb3_htr.zoo.run.malloc import keep_freed_memory
 from sb3_htr.zoo.run.manager import run_rl_zoo
 from sb3_htr.zoo.run.method import DEFAULT, get_method, methods
 from sb3_htr.zoo.run.storage import absolute
-from sb3_htr.zoo.run.trust import CONF, check_arguments, import_packages, see_working_folder
+from sb3_htr.zoo.run.trust import CONF, WEIGHTS, check_arguments, import_packages, see_working_folder
 
 # Options with a path behind "="
-PATHS_EQUAL = ("--conf-file=", "--tensorboard-log=", "--storage=")
+PATHS_EQUAL = ("--conf-file=", "--tensorboard-log=", "--storage=", "--trained-agent=")
 OWN_ENV = "An env of your own is found once its module is imported, by --gym-packages MODULE."
 HELP = """sb3-htr train: rl_zoo3's train (its arguments follow) with evaluations that adapt to validation tasks.
 
@@ -85,11 +85,16 @@ def main(argv: Sequence[str]) -> None:
         if not {*OF_TRAINING} <= record.keys():
             raise ValueError(f"{run} is no run of sb3-htr train, so there is nothing to go on with: give the folder of one.")
         planned = record["n_timesteps"] + further.n_timesteps
-        # An interrupted training leaves a model, too, and so does one that goes on
-        if (done := n_steps_done(run)) >= planned and n_steps_of(run / f"{file_stem(record['env_id'])}.zip") >= planned:
-            more = done - record["n_timesteps"] + 1
-            to_go_on = shlex.join(["sb3-htr", "train", "--resume", str(run), "-n", str(more)])
-            print(f"{run} is finished, after {done:,} env steps. To train further, by so many steps or more: {to_go_on}")
+        # An interrupted training leaves a model, too, and so does one that goes on; of a finished one, the checkpoints may
+        # have been removed
+        done, trained = n_steps_done(run), n_steps_of(run / f"{file_stem(record['env_id'])}.zip")
+        if trained >= planned and (done >= planned or not done):
+            to_go_on = shlex.join(["sb3-htr", "train", "--resume", str(run), "-n", str(done - record["n_timesteps"] + 1)])
+            further_on = f"To train further, by so many steps or more: {to_go_on}"
+            print(
+                f"{run} is finished, after {trained:,} env steps. "
+                + (further_on if done else "Its checkpoints were removed, so it cannot be trained further.")
+            )
             return
         given = [*given_arguments(record["arguments"]), "--seed", str(record["seed"]), "-n", str(planned)]
         check_arguments(given, record["gym_packages"], run / RECORD, args.trust, args.gym_packages)
@@ -109,6 +114,8 @@ def main(argv: Sequence[str]) -> None:
             raise type(error)(f"{error} {OWN_ENV}") from None
         if env:
             _check_id(args.env)
+    if (weights := value_of(given, *WEIGHTS)) is not None and not Path(weights).is_file():
+        raise FileNotFoundError(f"There is no model {weights} to begin with: -i takes a file of `sb3-htr train` or `export`.")
     keep_freed_memory()
     try:
         run_rl_zoo(program, algorithm, [*default_arguments(algorithm), *given], args.method, run, args.trust)
@@ -125,7 +132,7 @@ def _from_anywhere(arguments: Sequence[str]) -> list[str]:
     """The same with whole paths, as a run may go on from another folder."""
     words = [part for word in arguments for part in (word.split("=", 1) if word.startswith(PATHS_EQUAL) else [word])]
     for i, (option, word) in enumerate(pairwise(words), start=1):
-        if option in ("-tb", "--tensorboard-log") or (option in CONF and Path(word).exists()):
+        if option in ("-tb", "--tensorboard-log", *WEIGHTS) or (option in CONF and Path(word).exists()):
             words[i] = str(Path(word).resolve())
         elif option == "--storage":
             words[i] = absolute(word)

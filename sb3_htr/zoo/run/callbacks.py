@@ -3,11 +3,12 @@
 import contextlib
 import os
 import warnings
+from pathlib import Path
 from typing import Any
 
 import optuna
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import CSVOutputFormat
+from stable_baselines3.common.logger import CSVOutputFormat, TensorBoardOutputFormat
 
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
 from sb3_htr.common.atomic import reason
@@ -24,6 +25,30 @@ class PatientCSV(CSVOutputFormat):
 
     def close(self) -> None:
         with contextlib.suppress(OSError):  # what could not be written before
+            super().close()
+
+
+class PatientTensorBoard(TensorBoardOutputFormat):
+    """
+    The same. TensorBoard's writer is of no use any more after an error, so it begins another file in its folder.
+
+    :param output: in whose place it writes
+    """
+
+    def __init__(self, output: TensorBoardOutputFormat) -> None:
+        self.writer, self._is_closed = output.writer, False
+
+    def write(self, *args: Any, **kwargs: Any) -> None:
+        try:
+            super().write(*args, **kwargs)
+        except OSError as error:
+            folder = self.writer.log_dir
+            warnings.warn(f"TensorBoard's {folder} could not be written ({reason(error)}). Training goes on.")
+            with contextlib.suppress(OSError):
+                self.writer = type(self.writer)(log_dir=folder)
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):
             super().close()
 
 
@@ -58,11 +83,15 @@ class ProgressCallback(BaseCallback):
         self._written = state
 
     def _begin(self) -> None:
+        # A run of a stranger may have a link there, to a file that is not the run's
+        Path(self.path).unlink(missing_ok=True)
         self._output = PatientCSV(self.path)
         self._output.keys = list(self._written["keys"])
         self._output.file.write(self._written["text"])
         self._output.file.flush()
-        self.logger.output_formats.append(self._output)
+        outputs = self.logger.output_formats
+        outputs[:] = [PatientTensorBoard(out) if isinstance(out, TensorBoardOutputFormat) else out for out in outputs]
+        outputs.append(self._output)
 
     def _end(self) -> None:
         if self._output in self.logger.output_formats:

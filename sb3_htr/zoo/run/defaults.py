@@ -5,6 +5,7 @@ from itertools import takewhile
 from typing import Any
 
 from sb3_htr.zoo.run.algorithm import Algorithm
+from sb3_htr.zoo.run.trust import WEIGHTS
 
 # PEARL's reference adapts for as many episodes. One thread: two runs on two cores must not fight for them
 ALWAYS = {"--num-threads": "1", "--save-freq": "20000", "--eval-episodes": "20"}
@@ -42,7 +43,7 @@ def training_facts(hyperparams: dict[str, Any], arguments: Sequence[str]) -> dic
         the weights of another
     """
     defaults = [word for option in ALWAYS.items() for word in option]
-    options = (("--eval-episodes",), ("--eval-freq",), ("--eval-env-kwargs",), ("-i", "--trained-agent"))
+    options = (("--eval-episodes",), ("--eval-freq",), ("--eval-env-kwargs",), WEIGHTS)
     return {**hyperparams, **{names[0]: value_of([*defaults, *arguments], *names) for names in options}}
 
 

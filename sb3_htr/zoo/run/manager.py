@@ -344,7 +344,10 @@ class MetaExperimentManager(ExperimentManager):
         :raises OSError: if it cannot be written
         """
         try:
-            super().save_trained_model(model)
+            # As rl_zoo3 does, but that of an id with a dot, what is behind it is no suffix
+            model.save(f"{self.save_path}/{self.env_name}.zip")
+            if self.save_replay_buffer and hasattr(model, "save_replay_buffer"):
+                model.save_replay_buffer(Path(self.save_path, "replay_buffer.pkl"))
         except WRITE_ERRORS as error:
             again = f"`{self._to_go_on()}` goes on from the last checkpoint"
             if not checkpoints(Path(self.save_path)):

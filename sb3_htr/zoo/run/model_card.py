@@ -13,7 +13,7 @@ from sb3_htr.zoo.run.defaults import given_arguments
 from sb3_htr.zoo.run.hub import model_name
 from sb3_htr.zoo.run.method import DEFAULT, PEARLMethod, get_method, methods
 from sb3_htr.zoo.run.shipped import hyperparams_file
-from sb3_htr.zoo.run.trust import PACKAGES
+from sb3_htr.zoo.run.trust import CONF, PACKAGES, WEIGHTS
 
 TAGS = (
     "deep-reinforcement-learning",
@@ -31,8 +31,6 @@ OF_EXPLORERS = """ The explorer says how z is chosen;
 # values. What a study brought is among the hyperparameters of the card
 LOCAL = {"-f": 1, "--log-folder": 1, "-tb": 1, "--tensorboard-log": 1, "-P": 0, "--progress": 0, "--verbose": 1, "--seed": 1}
 LOCAL |= dict.fromkeys(("--storage", "--study-name", "--trial-id"), 1)
-# Files: of settings, which others have if they come with the package, and of the weights that it began with
-SETTINGS, WEIGHTS = ("-conf", "--conf-file"), ("-i", "--trained-agent")
 
 
 def training_command(record: dict[str, Any]) -> str:
@@ -49,7 +47,8 @@ def training_command(record: dict[str, Any]) -> str:
         option, equals, value = word.partition("=")
         if option in LOCAL:
             del arguments[: 0 if equals else LOCAL[option]]
-        elif option in (*SETTINGS, *WEIGHTS):
+        elif option in (*CONF, *WEIGHTS):
+            # Settings that come with the package are on any machine; of the weights that it began with, there is the name
             file = Path(value if equals else arguments.pop(0))
             if option in WEIGHTS or (file.parent.name in ("", "hyperparams") and hyperparams_file(file.name).is_file()):
                 words += [option, file.name]

@@ -19,10 +19,13 @@ EVALUATED = ("policy_kwargs", "replay_buffer_kwargs")
 # Arguments of a training whose values rl_zoo3 evaluates as Python, key by key
 KEY_VALUES = ("-params", "--hyperparams", "--env-kwargs", "--eval-env-kwargs")
 CONF = ("-conf", "--conf-file")
-# Those that load no model, search or upload nothing. By their full names: an abbreviation could be one of any other
+# A model to begin with, whose weights and plain settings alone are taken
+WEIGHTS = ("-i", "--trained-agent")
+# Those that search or upload nothing. By their full names: an abbreviation could be one of any other
 HARMLESS = (
     *KEY_VALUES,
     *CONF,
+    *WEIGHTS,
     *("--algo", "--env", "--gym-packages", "-n", "--n-timesteps", "--seed", "--num-threads", "--vec-env", "--device"),
     *("-f", "--log-folder", "-tb", "--tensorboard-log", "--log-interval", "--verbose", "-P", "--progress", "-uuid", "--uuid"),
     *("--eval-freq", "--eval-episodes", "--n-eval-envs", "--save-freq", "--save-replay-buffer"),
@@ -87,7 +90,7 @@ def check_arguments(
             if not refused:
                 check_env_kwargs({key: ast.literal_eval(value)}, file, named)
         else:
-            refused = (option in CONF and Path(word).suffix not in (".yml", ".yaml")) or (
+            refused = (option in CONF and not word.endswith((".yml", ".yaml"))) or (
                 option == "--gym-packages" and word not in packages
             )
         if refused:
