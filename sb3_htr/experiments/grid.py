@@ -146,13 +146,13 @@ def replay(**settings: Any) -> dict[str, Any]:
 
 # The best of 50 trials of `sb3-htr optimize`, 60,000 env steps each, on validation tasks; docs/rivals.md has the command
 TUNED_DENSE: KwArgs = {
-    "learning_rate": 2.31e-4,
-    "gamma": 0.99475,
-    "tau": 0.00957,
-    "ent_coef": 0.0834,
-    "kl_coef": 0.00151,
+    "learning_rate": "lin_0.001897",
+    "gamma": 0.91581,
+    "tau": 0.01187,
+    "ent_coef": 0.00881,
+    "kl_coef": 0.000919,
     "gradient_steps": 512,
-    "policy_kwargs": {"latent_dim": 8},
+    "policy_kwargs": {"latent_dim": 6},
 }
 
 
