@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rl_zoo3.exp_manager import ExperimentManager
 
 from helpers import ENV_ID
 from helpers.runs import run_folder, train_arguments
+from sb3_htr import PEARL
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run.folder import claim, lock
 
@@ -81,15 +81,16 @@ def test_a_run_that_is_being_trained_cannot_be_gone_on_with(tmp_path: Path, monk
 def test_a_run_has_its_owner_until_its_last_model_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     saved = []
 
-    def save(manager: Any, model: Any) -> None:
+    def save(model: Any, path: str) -> None:
         with pytest.raises(ValueError, match="is being trained by another process"):
-            lock(Path(manager.save_path))
-        saved.append(Path(manager.save_path))
+            lock(Path(path).parent)
+        saved.append(Path(path))
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(ExperimentManager, "save_trained_model", save)
+    monkeypatch.setattr(PEARL, "save", save)
     assert main(train_arguments(Path("runs"), 240)) == 0
-    lock(saved[0]).release()
+    assert saved[-1].name == f"{ENV_ID}.zip"
+    lock(saved[-1].parent).release()
 
 
 def test_without_locks_of_the_system_nothing_is_owned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
