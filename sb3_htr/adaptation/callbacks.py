@@ -15,7 +15,7 @@ from sb3_htr.adaptation.evaluation import MetaLearner, first_success, record_ada
 from sb3_htr.adaptation.explorers import to_explorer
 from sb3_htr.common.atomic import WRITE_ERRORS, atomic_path, reason
 from sb3_htr.common.checks import get_task_family
-from sb3_htr.common.resume import numbers_of
+from sb3_htr.common.resume import numbers_of, restore_numbers
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
 
@@ -80,7 +80,7 @@ class MetaEvalCallback(EvalCallback):
         self.best_mean_reward = state["best_mean_reward"]
         # Older checkpoints have none
         for child, numbers in zip(self._children(), state.get("children", []), strict=False):
-            vars(child).update(numbers)
+            restore_numbers(child, numbers)
 
     def _children(self) -> list[BaseCallback]:
         """Callbacks that are called after an evaluation, and on a new best one."""

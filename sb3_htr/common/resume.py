@@ -20,6 +20,8 @@ from sb3_htr.common.settings import check_numbers
 
 # What is recorded but not written yet
 LOGGER_STATE = ("name_to_value", "name_to_count", "name_to_excluded")
+# Of a callback's attributes, those that are kept
+NUMBERS = (bool, int, float)
 
 
 @runtime_checkable
@@ -53,7 +55,16 @@ def numbers_of(callback: BaseCallback) -> dict[str, Any]:
     :param callback: that has no state of its own to tell, as SB3's have none
     :return: its numbers, counts among them
     """
-    return {name: value for name, value in vars(callback).items() if type(value) in (bool, int, float)}
+    return {name: value for name, value in vars(callback).items() if type(value) in NUMBERS}
+
+
+def restore_numbers(callback: BaseCallback, numbers: dict[str, Any]) -> None:
+    """
+    :param callback: which has these numbers
+    :param numbers: of :func:`numbers_of`; what else a file may name stays as it is
+    """
+    known = numbers_of(callback)
+    vars(callback).update({name: value for name, value in numbers.items() if name in known and type(value) in NUMBERS})
 
 
 def n_steps_done(run: Path) -> int:
@@ -156,8 +167,8 @@ class CheckpointCallback(BaseCallback):
             callback.n_calls = remembered["n_calls"]
             if isinstance(callback, HasState):
                 callback.load_state_dict(remembered["state"])
-            elif callback is not self:
-                vars(callback).update(remembered["state"] or {})  # older checkpoints have none
+            else:
+                restore_numbers(callback, remembered["state"] or {})  # older checkpoints have none
         self._last_calls = self.n_calls
         # Setting up the training makes a logger
         self._pending = state
@@ -270,7 +281,9 @@ class CheckpointCallback(BaseCallback):
     def _callback_states(self) -> list[dict[str, Any]]:
         states = []
         for callback in (self, *self.companions):
-            state = callback.state_dict() if isinstance(callback, HasState) else numbers_of(callback)
+            state = None if callback is self else numbers_of(callback)
+            if isinstance(callback, HasState):
+                state = callback.state_dict()
             file = io.BytesIO()
             try:
                 th.save(state, file)

@@ -13,7 +13,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL
-from sb3_htr.common.resume import CheckpointCallback, load_latest
+from sb3_htr.common.resume import CheckpointCallback, load_latest, restore_numbers
 from sb3_htr.common.vec_env import make_task_vec_env
 
 
@@ -90,6 +90,9 @@ def test_counts_of_callbacks_of_others_go_on(tiny_pearl: MakePEARL, tmp_path: Pa
             model.learn(n_rollouts * ROLLOUT, [callback, stop], reset_num_timesteps=i == 0)
         stopped_at.append(model.num_timesteps)
     assert stopped_at[0] == stopped_at[1] < 5 * ROLLOUT
+    # A file of a stranger changes numbers, and nothing else
+    restore_numbers(stop, {"n_episodes": 3, "max_episodes": "many", "_on_step": 1, "model": 2})
+    assert stop.n_episodes == 3 and stop.max_episodes == 11 and "_on_step" not in vars(stop) and stop.model is model
 
 
 def test_some_checkpoints_are_kept() -> None:
