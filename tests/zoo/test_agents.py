@@ -262,6 +262,11 @@ def test_the_command_of_a_record_is_that_of_any_machine(defaults: list[str]) -> 
     assert command == f"sb3-htr train -i agent.zip --env {ENV_ID} {params} --method htr-ec --seed 4"
 
 
+def test_a_record_may_end_with_an_option() -> None:
+    command = model_card.training_command({"arguments": ["-conf"], "seed": 4, "method": "htr-ec"})
+    assert command == "sb3-htr train --method htr-ec --seed 4"
+
+
 @pytest.mark.parametrize("file", ["pearl_prior.yml", "hyperparams/pearl_prior.yml"])
 @pytest.mark.parametrize("option", ["-conf", "--conf-file"])
 def test_the_command_of_a_record_names_settings_that_everybody_has(file: str, option: str) -> None:

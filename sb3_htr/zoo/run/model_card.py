@@ -49,7 +49,8 @@ def training_command(record: dict[str, Any]) -> str:
             del arguments[: 0 if equals else LOCAL[option]]
         elif option in (*CONF, *WEIGHTS):
             # Settings that come with the package are on any machine; of the weights that it began with, there is the name
-            file = Path(value if equals else arguments.pop(0))
+            file = Path(value if equals else "".join(arguments[:1]))
+            del arguments[: 0 if equals else 1]
             if option in WEIGHTS or (file.parent.name in ("", "hyperparams") and hyperparams_file(file.name).is_file()):
                 words += [option, file.name]
         else:
