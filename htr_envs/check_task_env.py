@@ -273,13 +273,13 @@ def _check_sparse(family: TaskFamily, traj: Trajectory, own_tasks: FloatArray) -
     if len(failures) == 0:
         return
     more = float(np.abs(failures).max())
-    advice = "compute_reward is what the task pays plus traj.task_free_reward."
     leak = (
-        f"The sparse reward of an unsuccessful step is not 0 (beside task_free_reward), which leaks the task, but {more:.2g}: "
+        f"The sparse reward of an unsuccessful step is not 0 (beside task_free_reward) but {more:.2g}, which leaks the task: "
     )
-    _require(more <= ROUNDING, leak + advice)
+    _require(more <= ROUNDING, leak + "compute_reward is what the task pays plus traj.task_free_reward.")
     worth = task_rewards[np.arange(len(own_tasks)), np.arange(len(own_tasks))]
-    _require((worth > 2 * ROUNDING).all(), "A step that solves its task exactly is worth no more than a failure.")
+    enough = bool((worth > failures.max() + ROUNDING).all())
+    _require(enough, "A step that solves its task exactly is worth no more than a failure.")
 
 
 def _check_no_leak(plain: Episode, other: Episode) -> None:

@@ -31,7 +31,7 @@ DoubleArray = NDArray[np.float64]
 
 FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 FRAME_WIDTH, FRAME_HEIGHT = 640, 400
-# From behind the start, looking down on all goals
+# From behind the start, looking down on it and on all goals
 AZIMUTH, ELEVATION = 90.0, -45.0
 # How far away, as multiples of the width and the depth of where they are
 DISTANCE = np.array([1.2, 1.45])
@@ -145,8 +145,9 @@ class MujocoDynamics(Dynamics[PositionGoalFamily]):
             open_no_window(render_mode)
             self.model.geom("goal").size[0] = task_family.goal_radius
             data = mujoco.MjData(self.model)  # of its own: a picture changes nothing in the simulation
-            goals = np.concatenate([task_family.train_tasks, task_family.validation_tasks, task_family.test_tasks])
-            low, high = goals.min(axis=0), goals.max(axis=0)
+            start, family = np.zeros((1, 2)), task_family
+            places = np.concatenate([start, family.train_tasks, family.validation_tasks, family.test_tasks])
+            low, high = places.min(axis=0), places.max(axis=0)
             camera = {"lookat": np.array([*(low + high) / 2, 0.0]), "distance": (DISTANCE * (high - low)).max()}
             camera |= {"azimuth": AZIMUTH, "elevation": ELEVATION}
             self._renderer = MujocoRenderer(self.model, data, camera, FRAME_WIDTH, FRAME_HEIGHT, camera_id=-1), data

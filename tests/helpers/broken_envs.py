@@ -344,7 +344,7 @@ class LeakingReward(LineFamily):
         return super().compute_reward(traj, task, *args) - np.abs(np.asarray(task, dtype=np.float32))
 
 
-@breaks("which leaks the task, but 5e-05: compute_reward is what the task pays plus traj.task_free_reward")
+@breaks("but 5e-05, which leaks the task: compute_reward is what the task pays plus traj.task_free_reward")
 class InexactReward(LineFamily):
     """More than rounding."""
 
