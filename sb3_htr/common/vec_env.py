@@ -49,7 +49,7 @@ class BatchedTaskVecEnv(VecEnv):
         self.reset_infos = self._split(info)
         self._reset_seeds()
         self._reset_options()
-        return self._kept(obs)
+        return obs.copy()  # an env may write into the same array at each step, and this one is kept
 
     def _batch_options(self) -> dict[str, Any] | None:
         keys = {key for options in self._options for key in options}
@@ -72,12 +72,7 @@ class BatchedTaskVecEnv(VecEnv):
             infos[i]["terminal_observation"] = final_obs[i]
             infos[i]["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
             self.reset_infos[i] = {"task_id": int(self.vector_env.task_ids[i])}  # type: ignore[attr-defined]
-        return self._kept(obs), rewards, dones, infos
-
-    @staticmethod
-    def _kept(obs: np.ndarray) -> np.ndarray:
-        """An env may write into the same array at each step."""
-        return obs.copy()
+        return obs.copy(), rewards, dones, infos  # as in reset
 
     def _split(self, info: dict[str, Any]) -> list[dict[str, Any]]:
         columns = [value.tolist() if value.ndim == 1 else list(value) for value in info.values()]

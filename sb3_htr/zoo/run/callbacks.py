@@ -30,7 +30,7 @@ class PatientCSV(CSVOutputFormat):
 
 class PatientTensorBoard(TensorBoardOutputFormat):
     """
-    The same. TensorBoard's writer is of no use any more after an error, so it begins another file in its folder.
+    As :class:`PatientCSV`. TensorBoard's writer is of no use any more after an error, so another file is begun in its folder.
 
     :param output: in whose place it writes
     """
@@ -54,7 +54,7 @@ class PatientTensorBoard(TensorBoardOutputFormat):
 
 class ProgressCallback(BaseCallback):
     """
-    Writes what the algorithm logs to a CSV file too, wherever else it goes.
+    Writes what the algorithm logs to a CSV file too, wherever else it goes, and sees to it that no log stops the training.
 
     :param path: file
     """

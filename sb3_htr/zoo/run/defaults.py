@@ -1,4 +1,4 @@
-"""What `sb3-htr train` puts in front of the arguments that a user gives to rl_zoo3's train: later ones win."""
+"""The arguments of a training: what `sb3-htr train` puts in front of a user's for rl_zoo3's train, where later ones win."""
 
 from collections.abc import Sequence
 from itertools import takewhile

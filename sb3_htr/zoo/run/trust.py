@@ -21,7 +21,7 @@ KEY_VALUES = ("-params", "--hyperparams", "--env-kwargs", "--eval-env-kwargs")
 CONF = ("-conf", "--conf-file")
 # A model to begin with, whose weights and plain settings alone are taken
 WEIGHTS = ("-i", "--trained-agent")
-# Those that search or upload nothing. By their full names: an abbreviation could be one of any other
+# Those that neither search nor upload, nor have code loaded. By their full names: an abbreviation could be one of any other
 HARMLESS = (
     *KEY_VALUES,
     *CONF,
