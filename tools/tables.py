@@ -69,10 +69,12 @@ def table(summary: dict[str, Any]) -> str:
     env_steps = " / ".join(f"{n:,}" for n in sorted({row["env_steps"] for row in rows}))
     about = f"{rows[0]['env']}, {env_steps} env steps, {_runs(rows)}."
     later = summary.get("evaluation_commit", summary["commit"])
+    # Interquartile means of three runs trim none
+    middle = "IQM over runs (of three or fewer, their mean)" if min(row["n_seeds"] for row in rows) <= 3 else "IQM over runs"
     commits = summary["commit"] if later == summary["commit"] else f"{summary['commit']}, evaluated by {later}"
     text = "\n".join("| " + " | ".join(line) + " |" for line in (head, ["---"] * len(head), *body))
     return (
-        f"{text}\n\n{about} Final models on the test tasks: IQM over runs, "
+        f"{text}\n\n{about} Final models on the test tasks: {middle}, "
         f"95 % bootstrap interval over runs, tasks and {summary.get('n_eval_seeds', 1)} evaluation seeds. "
         f"`{summary['command']}`, commit {commits}, {summary['machine']}.\n"
     )

@@ -89,11 +89,11 @@ def learning(results: Results, path: Path) -> None:
     left.set_xlim(left=0)
     left.set_xlabel("thousand env steps of meta-training")
     left.set_ylabel("return of the last adaptation episode")
-    left.set_title("validation tasks, during meta-training", fontsize=10)
+    left.set_title("validation tasks, during meta-training (interval over seeds)", fontsize=9)
     right.set_xlabel("adaptation episode")
     right.set_ylabel("return")
     right.xaxis.get_major_locator().set_params(integer=True)
-    right.set_title("test tasks, final models", fontsize=10)
+    right.set_title("test tasks, final models (over seeds, tasks and evaluation seeds)", fontsize=9)
     finish(figure, path, _title(results))
 
 

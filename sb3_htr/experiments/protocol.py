@@ -89,9 +89,14 @@ def seconds_to_solved(raw: Raw, evaluation: str) -> np.ndarray:
     return _when_solved(raw, raw["elapsed_s"])
 
 
+def is_solved(raw: Raw) -> np.ndarray:
+    """(n_evaluations,) bool, whether enough validation tasks were."""
+    return np.asarray(raw["solved"].mean(axis=1) >= SOLVED_SHARE)
+
+
 def _when_solved(raw: Raw, clock: np.ndarray) -> np.ndarray:
     """What the clock (n_evaluations,) shows."""
-    enough = raw["solved"].mean(axis=1) >= SOLVED_SHARE
+    enough = is_solved(raw)
     return np.atleast_2d(float(clock[enough.argmax()] if enough.any() else clock[-1] * (len(clock) + 1) / len(clock)))
 
 
@@ -104,6 +109,8 @@ _ALL = (
     seconds_to_solved,
 )
 METRICS: dict[str, Callable[[Raw, str], np.ndarray]] = {metric.__name__: metric for metric in _ALL}
+# Of a run that was never solved, they are known to be larger than what they are counted as
+TIMES = (env_steps_to_solved.__name__, seconds_to_solved.__name__)
 
 
 def scores(raws: list[Any], metric: str, evaluation: str) -> np.ndarray:

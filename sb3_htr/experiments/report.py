@@ -14,12 +14,12 @@ from sb3_htr.experiments import figures
 from sb3_htr.experiments.calibration import expected_calibration_error
 from sb3_htr.experiments.cell import REMOVE, Cell, Evaluation
 from sb3_htr.experiments.grid import Experiment
-from sb3_htr.experiments.protocol import EVAL_SEEDS, METRICS, scores
+from sb3_htr.experiments.protocol import EVAL_SEEDS, METRICS, TIMES, env_steps_to_solved, is_solved, scores
 from sb3_htr.experiments.runner import LOGGED, machine
 from sb3_htr.zoo.plots.intervals import iqm_difference, iqm_interval
 
 RETURN = "last_episode_return"
-STEPS = "env_steps_to_solved"
+STEPS = env_steps_to_solved.__name__
 # What a report is made of
 NEEDED = ("timesteps", "curve", "solved", "elapsed_s", "calibration")
 # Of the code that trained, and of that which evaluated
@@ -45,6 +45,11 @@ class Runs(NamedTuple):
     def returns(self, evaluation: Evaluation) -> np.ndarray:
         """(n_runs, n_eval_seeds, n_tasks), of the last adaptation episode."""
         return scores(self.raws, RETURN, evaluation.name)
+
+    @property
+    def n_unsolved(self) -> int:
+        """Runs that never solved enough of the validation tasks."""
+        return sum(not is_solved(raw).any() for raw in self.raws)
 
     def about(self, evaluation: Evaluation) -> dict[str, Any]:
         """What a number is of."""
@@ -94,7 +99,9 @@ def _rows(runs: Runs) -> Iterator[dict[str, Any]]:
     means = runs.means()
     for evaluation in runs.evaluations:
         for metric in METRICS:
-            interval = _rounded(iqm_interval(scores(runs.raws, metric, evaluation.name)))
+            interval: dict[str, Any] = _rounded(iqm_interval(scores(runs.raws, metric, evaluation.name)))
+            if metric in TIMES:
+                interval |= _limits(interval, "high", runs)
             yield {**runs.about(evaluation), "metric": metric, **interval, **means}
 
 
@@ -112,7 +119,14 @@ def _slowdown(first: Runs, other: Runs) -> dict[str, Any]:
     steps = [np.log(scores(runs.raws, STEPS, runs.evaluations[0].name)) for runs in (other, first)]
     estimate, low, high = np.exp(iqm_difference(*steps))
     about = other.about(other.evaluations[0])
-    return {**about, "of": first.cells[0].variant, "metric": STEPS, **_rounded((estimate, low, high))}
+    interval: dict[str, Any] = _rounded((estimate, low, high))
+    limits = {**_limits(interval, "low", first), **_limits(interval, "high", other)}
+    return {**about, "of": first.cells[0].variant, "metric": STEPS, **interval, **limits, "n_unsolved": other.n_unsolved}
+
+
+def _limits(interval: dict[str, Any], end: str, runs: Runs) -> dict[str, Any]:
+    """How much later than the budget a run would have solved enough is not known, so then there is no such limit."""
+    return {end: None if runs.n_unsolved else interval[end]}
 
 
 def _explorer_differences(runs: Runs) -> Iterator[dict[str, Any]]:
@@ -126,7 +140,7 @@ def _explorer_differences(runs: Runs) -> Iterator[dict[str, Any]]:
 
 def _rounded(interval: tuple[float, float, float]) -> dict[str, float]:
     # adding 0 turns -0 into 0
-    return {key: round(value, 3) + 0.0 for key, value in zip(("iqm", "low", "high"), interval, strict=True)}
+    return {key: round(value, 6) + 0.0 for key, value in zip(("iqm", "low", "high"), interval, strict=True)}
 
 
 def check(results: dict[Cell, Path]) -> None:

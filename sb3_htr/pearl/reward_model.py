@@ -86,8 +86,8 @@ class RewardModel(nn.Module):
         :param next_obs: (n, obs_dim), as all networks see it
         :param z: (m, latent_dim), task variables
         :param labels: of n states under m tasks
-        :return: means over all pairs of the cross-entropy of success, and of the negative log-likelihood of the rewards of
-            successes, in units of their mean; in nats
+        :return: means over all pairs with a task that was inferred of the cross-entropy of success, and of the negative
+            log-likelihood of the rewards of successes, in units of their mean; in nats
         """
         states, tasks = self.state_tower(next_obs), self.task_tower(z)
         # z that was inferred without a reward can be of any task

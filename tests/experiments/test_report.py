@@ -232,10 +232,12 @@ def test_tables_are_filled_in_between_their_marks_alone(tmp_path: Path) -> None:
 def test_a_slow_learner_needs_times_the_env_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 50)
     results = made_up(EXPERIMENTS["held_out_sector"].cells(2), tmp_path)
-    for solved, factor in (([0, 20, 20, 20], 2 / 3), ([0, 0, 0, 15], 5 / 3)):
+    for solved, factor, n_unsolved in (([0, 20, 20, 20], 2 / 3, 0), ([0, 0, 0, 15], 5 / 3, 2)):
         for cell, path in results.items():
             if cell.method == "pearl-dense":
                 np.savez(path, **{**np.load(path), "solved": np.arange(20) < np.array(solved)[:, None]})
         (slowdown,) = report.summarize("", results)["slowdowns"]
         assert slowdown["method"] == "pearl-dense" and slowdown["of"] == "htr-ser"
         assert slowdown["iqm"] == pytest.approx(factor, abs=1e-3), "never counts as one evaluation more than there were"
+        assert slowdown["n_unsolved"] == n_unsolved and slowdown["low"] == pytest.approx(factor, abs=1e-3)
+        assert (slowdown["high"] is None) == (n_unsolved > 0), "how much later it would have been is not known"

@@ -86,7 +86,8 @@ def test_curves_say_what_they_show(drawn: list[Figure], monkeypatch: pytest.Monk
     for n_seeds, n_points, said in (
         (1, 16, "env"),
         (2, 15, "env; mean and range of 2 seeds"),
-        (3, 2, "env; IQM over seeds, 95 % interval"),
+        (3, 15, "env; mean of 3 seeds, 95 % interval"),
+        (4, 2, "env; IQM over seeds, 95 % interval"),
     ):
         zeros = np.zeros((n_seeds, n_points))
         plots_of = {"a": curves.Curve(np.arange(n_points), zeros, zeros, "htr-ser")}

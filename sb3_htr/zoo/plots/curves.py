@@ -84,7 +84,7 @@ def plot_curves(curves: dict[str, Curve], path: Path, title: str, x_label: str, 
         axes.set_ylabel(y_label)
         axes.xaxis.get_major_locator().set_params(integer=True)
     span_unit_if_flat(left)
-    # Of two seeds, the IQM is the mean, and its bootstrap interval their range
-    seeds = {min(len(curve.returns), 3) for curve in curves.values()}
-    shown = {3: "IQM over seeds, 95 % interval", 2: "mean and range of 2 seeds"}
+    # Of three seeds and fewer, the IQM is the mean, and of two its bootstrap interval their range
+    seeds = {min(len(curve.returns), 4) for curve in curves.values()}
+    shown = {4: "IQM over seeds, 95 % interval", 3: "mean of 3 seeds, 95 % interval", 2: "mean and range of 2 seeds"}
     finish(figure, path, "; ".join([title, *(text for n, text in shown.items() if n in seeds)]))
