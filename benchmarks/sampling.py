@@ -17,7 +17,7 @@ def main() -> None:
     buffers = {k: model.replay_buffer for k, model in models.items() if model.replay_buffer is not None}
     sizes: dict[str, Any] = {
         "16 x (1024 + 256) rows": {"batch_size": 256, "meta_batch_size": 16, "context_size": 1024},
-        "64 x (20 + 16) rows, the fast profile": {"batch_size": 16, "meta_batch_size": 64, "context_size": 20},
+        "64 x (20 + 20) rows, the fast profile": {"batch_size": 20, "meta_batch_size": 64, "context_size": 20},
     }
     figures = []
     for size, kwargs in sizes.items():

@@ -1,5 +1,6 @@
 """Envs and settings that cannot work are refused in one sentence, before any work is lost."""
 
+import copy
 import warnings
 from collections.abc import Callable
 from functools import partial
@@ -25,7 +26,7 @@ from htr_envs.point_robot import PointRobotDynamics
 from sb3_htr import PEARL, evaluate_adaptation, load_untrusted
 from sb3_htr.adaptation import Step
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
-from sb3_htr.common.checks import get_task_family
+from sb3_htr.common.checks import check_tasks, family_facts, get_task_family
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
 from sb3_htr.rivals.rl2 import RL2
 from sb3_htr.rivals.scripted import ScriptedAgent
@@ -975,3 +976,97 @@ def test_an_evaluation_on_the_very_env_of_training(tiny_pearl: MakePEARL) -> Non
 def test_a_model_needs_an_env_for_its_networks() -> None:
     with pytest.raises(ValueError, match="PEARL has no env to make its networks for"):
         PEARL("MlpPolicy", None)
+
+
+class Band:
+    """An object that has no text of its own."""
+
+    def __init__(self, width: float) -> None:
+        self.width, self.itself = width, self
+
+
+def test_families_are_compared_by_all_that_is_in_them() -> None:
+    def facts(value: Any) -> dict[str, str]:
+        family = PointRobotFamily()
+        vars(family)["part"] = value
+        return family_facts(family)
+
+    tensor = th.arange(2000.0)
+    for one, other in (
+        (Band(0.2), Band(0.3)),
+        ([Band(0.2)], [Band(0.3)]),
+        ({"x": (Band(0.2),)}, {"x": (Band(0.3),)}),
+        (tensor, tensor + (tensor == 1000)),
+        ({0, 8}, {0, 16}),
+    ):
+        assert facts(one) != facts(other)
+        assert facts(one) == facts(copy.deepcopy(one))
+    # Neither where it is in memory, nor the order of a set, which another process may have otherwise
+    assert facts(np.random.default_rng(0)) == facts(np.random.default_rng(0))
+    assert list({0, 8}) != list({8, 0}) and facts({0, 8}) == facts({8, 0})
+
+
+@pytest.mark.parametrize("how", ["set_env", "load_replay_buffer"])
+def test_rewards_of_which_no_attribute_tells_are_compared(
+    how: str, tiny_pearl: MakePEARL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def env() -> Any:
+        return make_task_vec_env(ENV_ID, 4, env_kwargs=NEAR)
+
+    model = tiny_pearl(env()).learn(ROLLOUT)
+    model.save_replay_buffer(tmp_path / "buffer")
+    tiny_pearl(env()).load_replay_buffer(tmp_path / "buffer")
+    own = PointRobotFamily.compute_reward
+    monkeypatch.setattr(PointRobotFamily, "compute_reward", lambda *args, **kwargs: 2 * own(*args, **kwargs))
+    with pytest.raises(ValueError, match=r"What was collected is of another task family .* its compute_reward gives"):
+        if how == "set_env":
+            model.set_env(env())
+        else:
+            tiny_pearl(env()).load_replay_buffer(tmp_path / "buffer")
+
+
+@pytest.mark.parametrize(
+    ("tasks", "message"),
+    [
+        (np.zeros((2, 3)), "tasks have 3 numbers each, expected 2"),
+        ([[50.0, 50.0]], r"The task \[\[50.0, 50.0\]\] is not in Box"),
+    ],
+)
+def test_tasks_that_are_none_are_refused_before_the_training(tasks: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        MetaEvalCallback(ENV_ID, tasks=tasks)
+
+
+def test_evaluations_that_could_not_be_made_are_refused_before_the_training(tiny_pearl: MakePEARL) -> None:
+    """The first one may be at its end."""
+    model = tiny_pearl()
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        model.learn(ROLLOUT, MetaEvalCallback("SparseTargetSpeed-v0"))
+    model.knowledge.set_tells_success(False)
+    with pytest.raises(ValueError, match="explorer 'aggregate' goes by successes"):
+        MetaEvalCallback(ENV_ID, explorer="aggregate").init_callback(model)
+    assert model.num_timesteps == 0
+
+
+def test_the_env_that_is_on_another_task_is_named() -> None:
+    env = make_task_vec_env(ENV_ID, 2)
+    tasks = np.array([[1.0, 0.0], [0.0, 1.0]], dtype=np.float32)
+    env.set_options([{"task": task} for task in tasks])
+    env.reset()
+    with pytest.raises(ValueError, match=r"Env 1 was asked for the task \[1. 0.\], and is on \[0. 1.\]"):
+        check_tasks(env, tasks[[0, 0]])
+
+
+def test_observations_come_without_infos(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    for observation in (gym.make(ENV_ID).reset(), None):
+        with warnings.catch_warnings(), pytest.raises((ValueError, AttributeError)) as ours:
+            warnings.simplefilter("ignore")
+            model.predict(observation)  # type: ignore[arg-type]
+        if observation is not None:
+            assert "You have passed a tuple to the predict() function" in str(ours.value)
+
+
+def test_lists_are_observations_too(tiny_pearl: MakePEARL) -> None:
+    adaptation = tiny_pearl().learn(2 * ROLLOUT).start_adaptation(1, generator=th.Generator().manual_seed(0))
+    assert adaptation.act([[0.0, 0.0]]).shape == (1, 2)  # type: ignore[arg-type]

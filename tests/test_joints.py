@@ -443,3 +443,25 @@ def test_an_experiment(own_module: str, tmp_path: Path) -> None:
     summary = json.loads((tmp_path / "results" / "summary.json").read_text())
     assert {row["variant"] for row in summary["rows"]} == {"half"}
     assert plt.imread(tmp_path / "results" / "toy.png").shape[:2] == (1, 1), "by its own figure, of one result"
+
+
+class Quiet(Lattice):
+    """Does not call what it is derived from."""
+
+    def __init__(self) -> None:
+        self.width = 1.0
+
+
+def test_an_explorer_with_a_constructor_of_its_own(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl(explorer=Quiet(), train_explorer=Quiet()).learn(ROLLOUT)
+    assert model.explorer.name == "quiet"
+
+
+def test_rows_of_elsewhere_need_rewards(tiny_pearl: MakePEARL) -> None:
+    buffer = tiny_pearl().learn(ROLLOUT).replay_buffer
+    assert buffer is not None
+    ranges, tasks = np.array([[0, 20]]), np.zeros((1, 2), dtype=np.float32)
+    draw = HindsightDraw(buffer.episodes, ranges, ranges, tasks, is_relabelled=False, elsewhere=0.5)
+    draw.check(1, 2)
+    with pytest.raises(ValueError, match=r"elsewhere of a HindsightDraw is 0.5, and what is drawn there has the rewards of"):
+        draw._replace(is_relabelled=True).check(1, 2)

@@ -196,3 +196,24 @@ class Fragile(gym.Wrapper[Any, Any, Any, Any]):
         if self.n_steps == 30:
             raise ZeroDivisionError("a bug of the env")
         return self.env.step(action)
+
+
+def test_callbacks_see_what_sb3_has_in_a_rollout(tiny_pearl: MakePEARL) -> None:
+    seen: list[dict[str, Any]] = []
+
+    def look(local: dict[str, Any], _: Any) -> bool:
+        seen.append({name: local[name] for name in ("actions", "buffer_actions", "new_obs", "rewards", "dones", "infos")})
+        return True
+
+    model = tiny_pearl(seed=0).learn(ROLLOUT, look)
+    first = seen[0]
+    assert model.replay_buffer is not None
+    np.testing.assert_allclose(model.policy.scale_action(first["actions"]), first["buffer_actions"], atol=1e-6)
+    # The point moves by a tenth of its action
+    np.testing.assert_allclose(first["new_obs"], 0.1 * first["actions"], atol=1e-6)
+
+
+def test_adam_may_be_told_how_to_work(tiny_pearl: MakePEARL) -> None:
+    for how in ({"foreach": True}, {"fused": False}, {"weight_decay": 1e-3}):
+        model = tiny_pearl(policy_kwargs={"optimizer_kwargs": how, "net_arch": [8]}).learn(2 * ROLLOUT)
+        assert how.items() <= model.actor.optimizer.defaults.items()

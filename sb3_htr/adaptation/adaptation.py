@@ -10,7 +10,7 @@ from sb3_htr.adaptation.knowledge import LatentKnowledge
 from sb3_htr.adaptation.policy import ContextualPolicy
 from sb3_htr.common.task_reward import task_reward
 from sb3_htr.common.type_aliases import Context
-from sb3_htr.htr.episode_store import evenly_spread
+from sb3_htr.htr.groups import evenly_spread
 
 # Of observations, actions and rewards: networks see float32, of which larger ones have no squares
 LARGEST = 1e18
@@ -104,6 +104,7 @@ class Adaptation:
         :return: (n_envs, action_dim), scaled to [-1, 1]
         :raises ValueError: for an array of another shape, NaN and infinity
         """
+        obs = np.asarray(obs)
         if not self.is_training:
             self._check("observations", obs, self.policy.obs_dim)
         self.explorer.look(obs)

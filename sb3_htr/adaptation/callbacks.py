@@ -34,7 +34,8 @@ class MetaEvalCallback(EvalCallback):
     :param n_eval_episodes: adaptation episodes per task (PEARL's reference: 20)
     :param explorer: an :class:`sb3_htr.adaptation.Explorer`, its name, or its name and settings; the model's own by default
     :param kwargs: arguments of SB3's ``EvalCallback``
-    :raises ValueError: for settings that are none, and at the beginning of a training on this very env
+    :raises ValueError: for settings that are none, and at the beginning of a training on this very env, or with a model that
+        cannot adapt in it, or by this explorer
     """
 
     def __init__(
@@ -91,6 +92,10 @@ class MetaEvalCallback(EvalCallback):
             raise ValueError(
                 "eval_env is the env that is trained on, whose episodes an evaluation would break off: pass another."
             )
+        # The first evaluation may be at the end of the training
+        model = cast(MetaLearner, self.model)
+        model.check_env(self.eval_env)
+        model.start_adaptation(1, self.explorer, th.Generator())
         # SB3's warns where training and evaluation envs are of different types, which they may be here
         for folder in (self.best_model_save_path, self.log_path and os.path.dirname(self.log_path)):
             if folder:

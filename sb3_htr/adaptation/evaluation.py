@@ -74,7 +74,7 @@ def run_adaptation(
     obs: np.ndarray,
     n_episodes: int,
     deterministic: bool = True,
-    seed: int = 0,
+    seed: int | tuple[int, ...] = 0,
 ) -> AdaptationRecord:
     """
     Run ``n_episodes`` episodes of each env.
@@ -135,7 +135,12 @@ def task_set(family: TaskFamily, tasks: str | np.ndarray) -> np.ndarray:
     vectors = np.asarray(tasks, dtype=np.float32)
     if vectors.ndim != 2 or len(vectors) == 0:
         raise ValueError(f"tasks have shape {vectors.shape}, expected (n_tasks, task_dim) with at least one task.")
-    return vectors
+    own = np.shape(family.train_tasks)[1:]
+    if vectors.shape[1:] != own:
+        raise ValueError(f"tasks have {vectors.shape[1]} numbers each, expected {own[0]}, as those that the family trains on.")
+    # A family may know where its tasks lie
+    check: Any = getattr(family, "task_vectors", lambda tasks, _: tasks)
+    return np.asarray(check(vectors, vectors.shape))
 
 
 def record_adaptation(
@@ -182,7 +187,7 @@ def record_adaptation(
         index = np.minimum(np.arange(first, first + env.num_envs), len(tasks) - 1)
         obs = reset_to_tasks(env, tasks[index])
         adaptation = model.start_adaptation(env.num_envs, explorer, generator)
-        record = run_adaptation(model.policy, env, adaptation, obs, n_episodes, deterministic, seed + first)
+        record = run_adaptation(model.policy, env, adaptation, obs, n_episodes, deterministic, (seed, first))
         records.append([values[: len(tasks) - first] for values in record])
     length = max(achieved.shape[2] for _, _, achieved in records)
     for record_ in records:

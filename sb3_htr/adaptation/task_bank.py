@@ -9,7 +9,7 @@ from sb3_htr.common.checks import missing_hook
 from sb3_htr.common.random_state import get_generator_state, set_generator_state, stream
 from sb3_htr.common.task_reward import ROUNDING
 from sb3_htr.common.type_aliases import TaskFamily
-from sb3_htr.htr.episode_store import evenly_spread
+from sb3_htr.htr.groups import evenly_spread
 from sb3_htr.htr.transitions import Transitions
 
 # Training tasks that are in the bank; of more, evenly spread ones. The cost of an episode is flat from there on

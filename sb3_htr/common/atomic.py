@@ -28,7 +28,8 @@ def reason(error: Exception) -> str:
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
-    Write to a temporary name and rename at the end, so that a killed process leaves the old file or the new one.
+    Write to a temporary name and rename at the end, so that a killed process leaves the old file or the new one, or
+    none where a folder replaces a folder.
 
     :param path: file or folder to make; its parent folders are made too
     :return: path to write to, with the same suffix; removed if writing fails

@@ -46,7 +46,7 @@ def read_checkpoint(folder: str | os.PathLike[str]) -> dict[str, Any]:
     try:
         manifest = json.loads((folder / MANIFEST).read_text())
         found, expected = manifest["format"], manifest["sha256"][STATE]
-        writer = manifest["versions"]["sb3_htr"]
+        writer = manifest["versions"].get("sb3_htr", "of an unknown version")
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         raise DamagedCheckpoint(f"{folder} has no readable {MANIFEST}: it is damaged, or no checkpoint.") from None
     if found != FORMAT:

@@ -203,17 +203,44 @@ def family_facts(family: TaskFamily) -> dict[str, str]:
     :return: its class and its attributes in words, arrays as checksums: the same for two families that reward alike
     """
 
+    inside: list[Any] = [family]
+
     def fact(value: Any) -> str:
+        if isinstance(value, th.Tensor):
+            value = value.detach().cpu().numpy()
         if isinstance(value, np.ndarray):
             return f"array of shape {value.shape}, {hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()[:12]}"
+        if isinstance(value, set | frozenset):
+            return f"{type(value).__name__} of {sorted(map(fact, value))}"  # its order differs between processes
+        if type(value) in (list, tuple, dict) or _says_nothing(value):
+            return of_parts(value)
         with np.printoptions(threshold=sys.maxsize, floatmode="unique"):
-            # An object that does not say what it is names its address
-            return re.sub(r" at 0x[0-9a-f]+", "", repr(value))
+            # What does not say what it is names its address, numpy in capitals
+            return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(value))
+
+    def of_parts(value: Any) -> str:
+        if any(value is outer for outer in inside):
+            return "itself"
+        inside.append(value)
+        if isinstance(value, list | tuple):
+            parts = ", ".join(map(fact, value))
+            text = f"[{parts}]" if isinstance(value, list) else f"({parts}{',' * (len(value) == 1)})"
+        elif isinstance(value, dict):
+            text = f"{{{', '.join(f'{fact(key)}: {fact(part)}' for key, part in value.items())}}}"
+        else:
+            text = f"{type(value).__qualname__} with {of_parts(vars(value))}"
+        inside.pop()
+        return text
 
     # Attributes of a class and slots are in no __dict__
     tasks = {name: getattr(family, name, None) for name in ("train_tasks", "validation_tasks", "test_tasks")}
     attributes = tasks | getattr(family, "__dict__", {})
     return {"class": type(family).__qualname__, **{name: fact(value) for name, value in sorted(attributes.items())}}
+
+
+def _says_nothing(value: Any) -> bool:
+    """Whether it is an object that has attributes, and no text of its own."""
+    return type(value).__repr__ is object.__repr__ and hasattr(value, "__dict__")
 
 
 def check_same_family(before: dict[str, str], now: dict[str, str], what: str, known: str = "the collected experience") -> None:
@@ -293,8 +320,12 @@ def check_tasks(env: VecEnv, asked: np.ndarray) -> None:
     """
     if env.has_attr("task"):
         given = np.stack(env.get_attr("task"))
-        if given.shape != asked.shape or not np.allclose(given, asked, rtol=1e-5, atol=1e-6):
-            raise ValueError(f"The env was asked for the task {asked[0]}, and is on {given[0]}: {HAND_ON}")
+        wrong = np.ones(len(asked), dtype=bool)
+        if given.shape == asked.shape:
+            wrong = ~np.isclose(given, asked, rtol=1e-5, atol=1e-6).all(axis=1)
+        if wrong.any():
+            i = int(wrong.argmax())
+            raise ValueError(f"Env {i} was asked for the task {asked[i]}, and is on {given[i]}: {HAND_ON}")
 
 
 def check_device(device: th.device | str) -> None:

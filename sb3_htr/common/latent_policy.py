@@ -37,6 +37,8 @@ class LatentPolicy(BasePolicy):
         :return: actions, and the state for the next call
         :raises ValueError: for a state that is none, and observations that are no finite numbers
         """
+        if observation is None or isinstance(observation, tuple):
+            return super().predict(observation, None, episode_start, deterministic)  # SB3 says what is wrong with it
         n = len(observation) if np.ndim(observation) > 1 else 1  # type: ignore[arg-type]
         if state is not None and not (
             isinstance(state, tuple) and len(state) == 1 and np.shape(state[0]) in ((1, self.latent_dim), (n, self.latent_dim))

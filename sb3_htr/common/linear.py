@@ -197,7 +197,7 @@ class Stack(nn.Sequential):
         :return: (n, out_features)
         """
         layers = self._layers() if _suits_onednn(x) else None
-        return super().forward(x) if layers is None else _run(x, layers, list(self.parameters()))
+        return super().forward(x) if layers is None else _run(x, layers, [p for layer in self for p in layer.parameters()])
 
     def _layers(self) -> list[_Layer] | None:
         """What the modules are as layers, None if they are none."""

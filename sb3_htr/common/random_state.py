@@ -69,11 +69,11 @@ def set_global_state(state: dict[str, Any]) -> None:
 
 
 @contextmanager
-def seeded_actions(seed: int, deterministic: bool) -> Iterator[None]:
+def seeded_actions(seed: int | tuple[int, ...], deterministic: bool) -> Iterator[None]:
     """
     Actions that are drawn within, by torch's global generator, are those of a seed; then the generator is as it was before.
 
-    :param seed: of an evaluation; other draws of it, as those of z, have generators of this very seed
+    :param seed: of an evaluation, or of a part of it; other draws of it, as those of z, have generators of this very seed
     :param deterministic: whether none are drawn
     """
     with th.random.fork_rng(enabled=not deterministic):

@@ -145,6 +145,7 @@ class CheckpointCallback(BaseCallback):
         self.keep = keep
         self.companions = companions
         self._last_calls = 0
+        self._written: Path | None = None
         self._pending: dict[str, Any] | None = None
         self.stopping = self._stopped = False
 
@@ -240,6 +241,7 @@ class CheckpointCallback(BaseCallback):
         self._last_calls = self.n_calls
         if self.verbose > 0:
             print(f"Checkpoint: {folder}")
+        self._written = folder
         self._remove_old()
 
     def _on_training_end(self) -> None:
@@ -250,8 +252,9 @@ class CheckpointCallback(BaseCallback):
         self._remove_old()
 
     def _remove_old(self) -> None:
-        # Those of killed processes, too
-        for old in [*checkpoints(self.run)[self.keep :], *(self.run / "checkpoints").glob(".*_steps.*.tmp")]:
+        # Those of killed processes, too; but never the one just written, which may be behind others that are damaged
+        old_ones = [folder for folder in checkpoints(self.run)[self.keep :] if folder != self._written]
+        for old in [*old_ones, *(self.run / "checkpoints").glob(".*_steps.*.tmp")]:
             try:
                 shutil.rmtree(old)
             except OSError as error:

@@ -51,6 +51,18 @@ def check_numbers(**numbers: tuple[Any, float] | tuple[Any, float, float]) -> No
             raise ValueError(f"{name} is {value!r}, expected {article} {limits}.")
 
 
+def plain(value: Any) -> Any:
+    """
+    :param value: a setting
+    :return: the same, numbers of numpy in it as Python's: others SB3 writes as pickles, which only those read who trust a file
+    """
+    if isinstance(value, np.generic):
+        return value.item()
+    if type(value) is dict:
+        return {key: plain(part) for key, part in value.items()}
+    return type(value)(map(plain, value)) if type(value) in (list, tuple) else value
+
+
 def check_flags(**flags: Any) -> None:
     """
     :param flags: name of a setting and its value

@@ -8,7 +8,7 @@ from sb3_htr.common.checks import get_task_family, missing_hook
 from sb3_htr.common.type_aliases import Context, Trajectory
 from sb3_htr.common.vec_env import make_task_vec_env, reset_to_tasks
 from sb3_htr.experiments.cell import KwArgs
-from sb3_htr.htr.episode_store import evenly_spread
+from sb3_htr.htr.groups import evenly_spread
 from sb3_htr.pearl.pearl import PEARL
 from sb3_htr.zoo.run.algorithm import Model
 

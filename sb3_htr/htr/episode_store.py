@@ -8,18 +8,6 @@ import torch as th
 from sb3_htr.htr.groups import positions
 
 
-def evenly_spread(lengths: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """
-    What of an episode becomes its context: steps at equal distances, the last one among them, which may be all that counts.
-
-    :param lengths: (n,) int, number of steps of each episode
-    :param size: number of steps to take of each, at most
-    :return: the steps taken, those of the first episode first, and (n,) int, how many are of each
-    """
-    taken = np.minimum(lengths, size)
-    return (positions(taken) + 1) * np.repeat(lengths, taken) // np.repeat(taken, taken) - 1, taken
-
-
 class EpisodeIndex(NamedTuple):
     """
     The stored transitions as one virtual list, ordered by task and within a task from the oldest to the newest episode.

@@ -18,7 +18,11 @@ from sb3_htr.htr.episode_store import EpisodeStore
 from sb3_htr.htr.groups import ascending, first_rows, positions
 from sb3_htr.htr.n_step import n_step_returns, steps_ahead
 from sb3_htr.htr.relabel import RELABELLERS, Relabeller
+from sb3_htr.htr.reward_hook import check_rewards_told
 from sb3_htr.htr.transitions import Transitions
+
+# Of what was saved, how many rewards are compared with those of the task family
+N_COMPARED = 1000
 
 
 def spread(rng: np.random.Generator, ranges: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -178,14 +182,6 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         reward, task_free = (episodes.rows[index.rows, column] for column in (columns.reward, columns.task_free_reward))
         return np.logical_or.reduceat(np.abs(reward - task_free) > ROUNDING, index.episode_row[:-1])
 
-    def rewarded_fraction(self, episodes: EpisodeStore) -> float:
-        """
-        :param episodes: the buffer's own, or those of a relabeller
-        :return: share of them with a reward beside the task-free one, 0 if there are none
-        """
-        rewarded = self.rewarded(episodes)
-        return float(rewarded.mean()) if len(rewarded) else 0.0
-
     def stats(self) -> dict[str, float]:
         """
         :return: what is worth logging, by its key
@@ -297,7 +293,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """
         :param state: of :meth:`state_dict` of a buffer with the same settings
-        :raises ValueError: if it is of another task family, or of a store of other sizes
+        :raises ValueError: if it is of another task family, by its attributes or its rewards, or of a store of other sizes
         """
         check_same_family(state["task_family"], family_facts(self.task_family), "This model's env")
         own, by = self._relabelled_by, state["relabelled_by"]
@@ -308,9 +304,32 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             )
         self.relabeller.load_state_dict(state["relabeller"])
         self.episodes.load_state_dict(state["episodes"])
+        self.check_rewards_of(self.task_family)
         for generator, saved in zip((self._rng, self.relabel_rng), state["random"], strict=True):
             set_generator_state(generator, saved)
         self.discard_open_episodes()
+
+    def check_rewards_of(self, family: TaskFamily) -> None:
+        """
+        Attributes do not tell all that a reward depends on.
+
+        :param family: that is to tell rewards of what is stored
+        :raises ValueError: if it tells others than were stored
+        """
+        index, columns = self.episodes.index(), self.transitions
+        if len(index.rows) == 0 or missing_hook(family) is not None:
+            return
+        rewarded = np.flatnonzero(np.repeat(self.rewarded(self.episodes), np.diff(index.episode_row)))
+        # Not drawn: as many random numbers are to follow as without
+        some = [of[:: max(1, 2 * len(of) // N_COMPARED)] for of in (np.arange(len(index.rows)), rewarded)]
+        virtual = np.concatenate(some)
+        task = np.searchsorted(index.task_row, virtual, side="right") - 1
+        rows = self.episodes.take(virtual)
+        computed = family.compute_reward(columns.trajectory(rows[:, None]), family.train_tasks[task])
+        try:
+            check_rewards_told(rows[:, columns.reward], np.asarray(computed)[:, 0], task)
+        except ValueError as error:
+            raise ValueError(f"What was collected is of another task family than that of this env. {error}") from None
 
     def sample(  # type: ignore[override]
         self,

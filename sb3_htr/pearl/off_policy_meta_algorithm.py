@@ -33,7 +33,7 @@ from sb3_htr.common.latent_policy import Obs, State
 from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.random_state import MAX_SEED, get_generator_state, seeded_actions, set_generator_state, stream
 from sb3_htr.common.saving import CheckedFiles, with_suffix
-from sb3_htr.common.settings import check_keywords, check_numbers
+from sb3_htr.common.settings import check_keywords, check_numbers, plain
 from sb3_htr.common.training_state import Resumable
 from sb3_htr.common.vec_env import in_float32, make_task_vec_env
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
@@ -66,12 +66,9 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
     :param env: env of a task family (see ``htr_envs.TaskEnv``), VecEnv of such envs, or registered id
     :param n_tasks_per_rollout: training tasks per rollout
     :param n_episodes_per_task: episodes on each of them
-    :param learning_starts: env steps with random actions before learning starts
-    :param gradient_steps: updates after each rollout
-    :param batch_size: transitions per task for actor and critics, at most
     :param context_size: transitions per task for the context, at most
-    :param gamma: discount
-    :param n_steps: steps of a return before a value is asked for. Which of these seven are None follow from the time limit:
+    :param n_steps: steps of a return before a value is asked for. Which of these three, and of SAC's ``learning_starts``,
+        ``gradient_steps``, ``batch_size`` and ``gamma``, are None follow from the time limit:
         :func:`sb3_htr.pearl.horizon.settings_for`
     :param explorer: chooses z at meta-test: an explorer, its name, or its name and settings
     :param train_explorer: the same for rollouts
@@ -94,11 +91,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         *,
         n_tasks_per_rollout: int,
         n_episodes_per_task: int | None,
-        learning_starts: int | None,
-        gradient_steps: int | None,
-        batch_size: int | None,
         context_size: int | None,
-        gamma: float | None,
         n_steps: int | None,
         explorer: Explorer | dict[str, Any] | str,
         train_explorer: Explorer | dict[str, Any] | str,
@@ -129,10 +122,6 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         super().__init__(
             policy=policy,
             env=env,  # type: ignore[arg-type]
-            gamma=gamma,  # type: ignore[arg-type]
-            learning_starts=learning_starts,  # type: ignore[arg-type]
-            gradient_steps=gradient_steps,  # type: ignore[arg-type]
-            batch_size=batch_size,  # type: ignore[arg-type]
             replay_buffer_class=buffer_class,
             replay_buffer_kwargs=replay_buffer_kwargs,
             policy_kwargs={} if policy_kwargs is None else dict(policy_kwargs),
@@ -177,6 +166,8 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         self._introduce_policy()
 
     def _complete_settings(self) -> None:
+        settings = ("policy_kwargs", "replay_buffer_kwargs")
+        vars(self).update({k: plain(v) for k, v in vars(self).items() if k in settings or isinstance(v, np.generic)})
         # Without an env, which is for files alone, the settings come from there
         max_episode_steps = n_envs = 1
         check_numbers(n_tasks_per_rollout=(self.n_tasks_per_rollout, 1))
@@ -261,6 +252,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         if self.replay_buffer is not None and self.replay_buffer.size() > 0:
             known = checks.family_facts(self.replay_buffer.task_family)
             checks.check_same_family(known, checks.family_facts(family), "The env")
+            self.replay_buffer.check_rewards_of(family)
             if n_steps > self.replay_buffer.max_episode_steps:
                 raise ValueError(
                     f"The env's time limit is {n_steps} steps, and what was collected has room for episodes of "
@@ -408,14 +400,15 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         steps = adaptation_steps(env, adaptation, self.n_episodes_per_task, self.policy.unscale_action, act, obs)
         while (step := self._next_step(steps, tasks)) is not None:
             # SB3's names, for callbacks
-            rewards, dones, infos = step.rewards, step.dones, step.infos
+            rewards, dones, infos, new_obs = step.rewards, step.dones, step.infos, step.next_observations
+            buffer_actions, actions = step.actions, self.policy.unscale_action(step.actions)
             self.num_timesteps += env.num_envs
             # Give access to local variables
             callback.update_locals(locals())
             if not callback.on_step():
                 return False
             self._update_info_buffer(infos, dones)
-            replay_buffer.add(step.observations, step.next_observations, step.actions, rewards, dones, infos)
+            replay_buffer.add(step.observations, new_obs, step.actions, rewards, dones, infos)
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
             self._episode_num += int(dones.sum())
         return True

@@ -98,7 +98,7 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
         optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
         check_numbers(latent_dim=(latent_dim, 1))
-        if optimizer_class is th.optim.Adam:
+        if optimizer_class is th.optim.Adam and not {"foreach", "differentiable"} & {*(optimizer_kwargs or ())}:
             optimizer_kwargs = {"fused": True, **(optimizer_kwargs or {})}
         self.latent_dim = latent_dim
         self.encoder_arch = [128, 128] if encoder_arch is None else encoder_arch

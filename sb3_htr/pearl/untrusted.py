@@ -67,6 +67,8 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
         data, weights = read_model(path, ("policy", "knowledge"))
         settings: dict[str, Any] = {name: _plain(data[name]) for name in EXPLORERS}
         settings |= {name: data[name] for name in NUMBERS if type(data.get(name)) in (int, float)}
+        if pickled := [name for name in NUMBERS[1:] if PICKLED in str(data.get(name)) and name not in WORDS]:
+            warnings.warn(f"{pickled[0]} is in {path} as no plain number, and is left at its default.", stacklevel=2)
         settings |= {name: data[name] for name, words in WORDS.items() if re.fullmatch(words, str(data.get(name)))}
         settings |= _schedule(data.get("learning_rate"))
         replay = data.get("replay_buffer_kwargs")
@@ -133,8 +135,12 @@ def _policy_kwargs(given: dict[str, Any]) -> dict[str, Any]:
     n_critics = kwargs.get("n_critics", 2)
     if type(n_critics) is not int or not 1 <= n_critics <= MAX_LAYERS:
         raise Refused(f"PEARL does not have {n_critics} critics here: expected from 1 to {MAX_LAYERS}.")
-    for units in (kwargs.get("net_arch", []), kwargs.get("encoder_arch", []), [kwargs.get("latent_dim", 1)]):
-        if len(units) > MAX_LAYERS or not all(type(unit) is int and 1 <= unit <= MAX_UNITS for unit in units):
+    arch = kwargs.get("net_arch", [])
+    # SB3 takes one for actor and critics each, too
+    parts = [*arch.values()] if isinstance(arch, dict) and arch.keys() == {"pi", "qf"} else [arch]
+    for units in (*parts, kwargs.get("encoder_arch", []), [kwargs.get("latent_dim", 1)]):
+        whole = isinstance(units, list) and all(type(unit) is int and 1 <= unit <= MAX_UNITS for unit in units)
+        if not whole or len(units) > MAX_LAYERS:
             raise Refused(f"PEARL's networks do not have layers of {units} units.")
     return {**kwargs, "normalize_observations": bool(kwargs.get("normalize_observations", True))}
 

@@ -1,5 +1,6 @@
 """What a checkpoint can hold, it holds; what it cannot, nobody learns of when the training is to go on."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL
-from sb3_htr.common.resume import CheckpointCallback, load_latest, restore_numbers
+from sb3_htr.common.resume import CheckpointCallback, checkpoints, load_latest, restore_numbers
 from sb3_htr.common.vec_env import make_task_vec_env
 
 
@@ -98,3 +99,17 @@ def test_counts_of_callbacks_of_others_go_on(tiny_pearl: MakePEARL, tmp_path: Pa
 def test_some_checkpoints_are_kept() -> None:
     with pytest.raises(ValueError, match="keep is 0, expected a whole number of at least 1"):
         CheckpointCallback(1, "run", keep=0)
+
+
+def test_the_checkpoint_just_written_is_kept(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    """Behind a later one that is damaged, from which nothing could go on."""
+    tiny_pearl().learn(4 * ROLLOUT, CheckpointCallback(1, str(tmp_path), keep=4))
+    for folder in checkpoints(tmp_path)[:2]:
+        shutil.rmtree(folder)
+        folder.mkdir()
+    callback, model = CheckpointCallback(ROLLOUT // 4, str(tmp_path), keep=1), tiny_pearl()
+    with pytest.warns(UserWarning, match="next older checkpoint"):
+        callback.restore(model, load_latest(tmp_path)[1])
+    model.learn(ROLLOUT, callback, reset_num_timesteps=False)
+    with pytest.warns(UserWarning, match="next older checkpoint"):
+        assert load_latest(tmp_path)[0].name == f"{3 * ROLLOUT}_steps"

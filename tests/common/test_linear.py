@@ -181,3 +181,11 @@ def test_what_torch_adds_to_a_layer_is_kept(what: str) -> None:
         else:
             parametrize.register_parametrization(first, "weight", nn.Tanh())
     th.testing.assert_close(stack(x), plain(x))
+
+
+@pytest.mark.usefixtures("everything_through_onednn")
+def test_a_layer_may_come_twice() -> None:
+    layer = nn.Linear(8, 8)
+    sequence = nn.Sequential(layer, nn.ReLU(), layer)
+    stack, x = with_fast_layers(nn.Sequential(*sequence)), th.randn(2 * MIN_ROWS, 8)
+    th.testing.assert_close(stack(x), sequence(x), rtol=1e-4, atol=1e-4)

@@ -86,3 +86,10 @@ def test_a_training_after_one_that_was_interrupted_in_its_first_rollout(tiny_pea
     with pytest.raises(KeyboardInterrupt):
         model.learn(ROLLOUT, callback=interrupt, progress_bar=True)
     assert model.learn(ROLLOUT).num_timesteps == ROLLOUT
+
+
+def test_a_clock_of_another_process_is_no_clock(tiny_pearl: MakePEARL) -> None:
+    callback = MetaProgressBarCallback()
+    callback._n_updates, callback._rollout_start, callback._rollout_end = 3, 1e9, 1e9 - 10
+    tiny_pearl().learn(2 * ROLLOUT, callback)
+    assert 0 <= callback._share <= 1

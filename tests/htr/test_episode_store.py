@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sb3_htr.htr.episode_store import EpisodeStore, evenly_spread
+from sb3_htr.htr.episode_store import EpisodeStore
+from sb3_htr.htr.groups import evenly_spread
 
 
 @given(st.lists(st.tuples(st.integers(0, 2), st.integers(1, 4)), max_size=40), st.integers(0, 3))

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL
 from helpers.experience import FAMILY, add_episode, by_task, filled, make_buffer
+from htr_envs import PointRobotFamily
 from sb3_htr import MultiTaskReplayBuffer, evaluate_adaptation
 from sb3_htr.common.type_aliases import Context
 from sb3_htr.common.vec_env import make_task_vec_env
@@ -268,3 +269,12 @@ def test_reset_forgets(tiny_pearl: MakePEARL) -> None:
 def test_bad_settings_are_refused(kind: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make_buffer(relabeller=kind)
+
+
+@kinds
+def test_rewards_may_be_of_double_precision(
+    kind: dict[str, Any], tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = PointRobotFamily.compute_reward
+    monkeypatch.setattr(PointRobotFamily, "compute_reward", lambda *a, **k: own(*a, **k).astype(np.float64))
+    tiny_pearl(replay_buffer_kwargs={"relabel_probability": 1.0, "relabeller": kind}).learn(2 * ROLLOUT)

@@ -316,3 +316,32 @@ def test_networks_of_default_sizes_are_read_without_trust(tiny_pearl: MakePEARL,
     tiny_pearl(policy_kwargs={"activation_fn": th.nn.Tanh}).save(tmp_path / "tanh")
     with pytest.raises(ValueError, match="has the setting 'activation_fn', which only"):
         load_untrusted(tmp_path / "tanh", env)
+
+
+def test_numbers_of_numpy_are_numbers_to_all_who_read_a_file(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    """As a sweep over an array gives them."""
+    numbers: dict[str, Any] = {"gamma": np.float32(0.5), "context_size": np.int64(7), "batch_size": np.int32(5)}
+    numbers["explorer"] = Prior(n_exploration_episodes=np.int64(2))  # type: ignore[arg-type]
+    numbers["replay_buffer_kwargs"] = {"relabel_probability": np.float64(0.5)}
+    model = tiny_pearl(**numbers, policy_kwargs=with_policy(latent_dim=np.int64(2), net_arch=[np.int64(8)]))
+    model.learn(2 * ROLLOUT).save(tmp_path / "model")
+    for loaded in (PEARL.load(tmp_path / "model"), load_untrusted(tmp_path / "model", ENV_ID)):
+        assert (loaded.gamma, loaded.context_size, loaded.batch_size) == (0.5, 7, 5)
+        assert loaded.explorer == Prior(2) and loaded.policy.latent_dim == 2
+        assert loaded.replay_buffer_kwargs == {"relabel_probability": 0.5}
+
+
+def test_a_number_that_is_pickled_is_missed(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    model = tiny_pearl()
+    model.gamma = np.float32(0.5)  # type: ignore[assignment]
+    model.save(tmp_path / "model")
+    with pytest.warns(UserWarning, match="gamma is in .* as no plain number, and is left at its default"):
+        load_untrusted(tmp_path / "model", ENV_ID)
+
+
+def test_layers_of_actor_and_critics_may_differ(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    model = tiny_pearl(policy_kwargs=with_policy(net_arch={"pi": [8], "qf": [9, 10]})).learn(2 * ROLLOUT)
+    model.save(tmp_path / "model")
+    loaded = load_untrusted(tmp_path / "model", ENV_ID)
+    for a, b in zip(evaluate_adaptation(model, ENV_ID), evaluate_adaptation(loaded, ENV_ID), strict=True):
+        np.testing.assert_array_equal(a, b)

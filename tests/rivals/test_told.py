@@ -180,3 +180,16 @@ def test_rewards_that_are_not_those_of_the_tasks_are_refused() -> None:
 
     with pytest.raises(ValueError, match=r"The env gave 0\.5 for a step of task .*, but its compute_reward gives 0"):
         tiny_sac_her(Pays(gym.make(ENV_ID))).learn(20)
+
+
+class Silent(gym.Wrapper[Any, Any, Any, Any]):
+    """Does not name what a step achieved."""
+
+    def step(self, action: Any) -> Any:
+        *others, info = self.env.step(action)
+        return *others, {key: value for key, value in info.items() if key != "achieved_task"}
+
+
+def test_an_env_need_not_name_what_a_step_achieved() -> None:
+    model = tiny_sac_her(make_task_vec_env(ENV_ID, 4, wrapper=Silent)).learn(160)
+    assert model.num_timesteps == 160

@@ -2,10 +2,12 @@
 
 import copy
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, TypeVar
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
+
+from sb3_htr.common.settings import plain
 
 if TYPE_CHECKING:
     from sb3_htr.adaptation.adaptation import Adaptation, Step
@@ -25,9 +27,17 @@ class Explorer(ABC):
     #: Whether it goes by which rewards are those of a success, which not all families tell
     needs_success: ClassVar[bool] = False
 
+    def __new__(cls, *args: Any, **kwargs: Any) -> "Explorer":
+        # A subclass may have an __init__ of its own
+        explorer = super().__new__(cls)
+        explorer.name = cls.__name__.lower()
+        return explorer
+
     def __post_init__(self) -> None:
+        for field in fields(self):
+            setattr(self, field.name, plain(getattr(self, field.name)))
         #: In YAML files and records
-        self.name = type(self).__name__.lower()
+        self.name: str
         self.adaptation: Adaptation
         #: (n_envs, latent_dim) float32, the z to act with from now on
         self.z: np.ndarray

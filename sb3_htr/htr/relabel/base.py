@@ -55,8 +55,14 @@ class HindsightDraw(NamedTuple):
         """
         :param m: number of rows that were to be relabelled
         :param task_dim: length of a task
-        :raises ValueError: if it is not for so many, or ranges are not within the store
+        :raises ValueError: if it is not for so many, ranges are not within the store, or rows of elsewhere would keep the
+            rewards of other tasks
         """
+        if self.is_relabelled and self.elsewhere:
+            raise ValueError(
+                f"elsewhere of a HindsightDraw is {self.elsewhere}, and what is drawn there has the rewards of other tasks: "
+                "expected 0, or is_relabelled=False."
+            )
         n_rows = len(self.store.index().rows)
         for name, ranges in (("context", self.context), ("batch", self.batch)):
             if ranges.shape != (m, 2) or ranges.dtype.kind != "i":

@@ -52,7 +52,8 @@ class HindsightBuffers(Relabeller):
         return int(np.count_nonzero(self.episodes.n_added))
 
     def stats(self) -> dict[str, float]:
-        real, hindsight = (self.buffer.rewarded_fraction(episodes) for episodes in (self.buffer.episodes, self.episodes))
+        rewarded = [self.buffer.rewarded(episodes) for episodes in (self.buffer.episodes, self.episodes)]
+        real, hindsight = (float(some.mean()) if len(some) else 0.0 for some in rewarded)
         return {
             "replay/rewarded_fraction_real": real,
             "replay/rewarded_fraction_hindsight": hindsight,

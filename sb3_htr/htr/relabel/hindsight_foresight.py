@@ -5,8 +5,7 @@ import torch as th
 
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.type_aliases import Context
-from sb3_htr.htr.episode_store import evenly_spread
-from sb3_htr.htr.groups import first_rows, positions
+from sb3_htr.htr.groups import evenly_spread, first_rows, positions
 from sb3_htr.htr.relabel.training_task import TrainingTaskRelabelling
 
 # Pairs of an episode and a task that networks look at together, to bound memory
@@ -47,7 +46,7 @@ class HindsightForesight(TrainingTaskRelabelling):
         policy, columns, family = self.policy, self.buffer.transitions, self.buffer.task_family
         tasks = family.train_tasks
         n_episodes, n_tasks, n_starts = len(lengths), len(tasks), len(starts)
-        rewards = family.compute_reward(columns.trajectory(rows), tasks)
+        rewards = np.asarray(family.compute_reward(columns.trajectory(rows), tasks), dtype=np.float32)
         # Each episode once for each task
         repeated = np.repeat(lengths, n_tasks)
         row = positions(repeated) + np.repeat(np.repeat(first_rows(lengths), n_tasks), repeated)

@@ -4,8 +4,7 @@ import numpy as np
 import torch as th
 
 from sb3_htr.common.settings import check_numbers
-from sb3_htr.htr.episode_store import evenly_spread
-from sb3_htr.htr.groups import first_rows
+from sb3_htr.htr.groups import evenly_spread, first_rows
 from sb3_htr.htr.relabel.training_task import TrainingTaskRelabelling
 
 LEVELS = ("episode", "transition")
