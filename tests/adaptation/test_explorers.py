@@ -386,7 +386,7 @@ def test_the_learned_prior_draws_training_tasks_and_then_from_the_posterior(tiny
     model = tiny_pearl()
     know_tasks(model, 6)
     model.knowledge.is_train[4:6] = False
-    adaptation = begin(model, LearnedPrior(n_exploration_episodes=5), n_envs=200)
+    adaptation = begin(model, LearnedPrior(n_exploration_episodes=5, hindsight_share=0), n_envs=200)
     places, rewards = walk(adaptation, np.full(200, 2.0), n_episodes=8)
     assert (places == places[..., :1]).all(), "one z an episode"
     assert set(places[:, :5].flat) == {0, 1, 2, 3}, "draws with repetition, whatever was found"
@@ -396,6 +396,22 @@ def test_the_learned_prior_draws_training_tasks_and_then_from_the_posterior(tiny
     assert not adaptation.explorer.exploring().any()
     mean, _ = adaptation.posterior()
     assert len(np.unique(mean, axis=0)) > 1, "the encoder's posterior, too, is over all episodes"
+
+
+def test_the_learned_prior_may_be_wrong(tiny_pearl: MakePEARL) -> None:
+    """A task that is none of training: a small share of the prior is for it, which misses make large."""
+    model = tiny_pearl()
+    know_tasks(model, 6)
+    model.knowledge.is_train[4:6] = False
+    solved = []
+    for share in (0.0, 0.03, 1.0):
+        adaptation = begin(model, LearnedPrior(hindsight_share=share), n_envs=200)
+        places, rewards = walk(adaptation, np.full(200, 5.0), n_episodes=20)
+        assert (places[:, :5] >= 4).mean() == pytest.approx(share, abs=0.02)
+        solved.append((rewards[:, -1] > 0).any(axis=1).mean())
+    assert solved[0] == 0 and min(solved[1:]) > 0.9
+    with pytest.raises(ValueError, match="hindsight_share is 2, expected a number from 0 to 1"):
+        LearnedPrior(hindsight_share=2)
 
 
 def test_what_is_known_about_z_before_a_reward(tiny_pearl: MakePEARL) -> None:
