@@ -3,7 +3,7 @@
 import json
 import platform
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import yaml
@@ -12,13 +12,13 @@ from filelock import Timeout
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.common.resume import checkpoints, n_steps_done
+from sb3_htr.common.resume import checkpoints
 from sb3_htr.common.versions import commit, named, processor
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.log import logged
 from sb3_htr.experiments.protocol import evaluate
 from sb3_htr.zoo.commands import train
-from sb3_htr.zoo.run.agents import RECORD, agent_at, file_stem, find_runs, n_steps_of, read_record
+from sb3_htr.zoo.run.agents import RECORD, agent_at, find_runs, is_finished, n_steps_of, read_record
 from sb3_htr.zoo.run.algorithm import Model
 from sb3_htr.zoo.run.defaults import training_facts
 from sb3_htr.zoo.run.folder import SystemLock
@@ -28,6 +28,9 @@ from sb3_htr.zoo.run.trust import import_packages
 
 # Means over the training of what HTR paper, B.2 reasons with
 LOGGED = ("relabelled_fraction", "rl_reward_mean", "rl_zero_reward_fraction")
+
+# Of a record, beside its hyperparameters and arguments
+OF_RUN = ("env_id", "env_kwargs", "method", "seed", "n_timesteps")
 
 # Asked when the code is imported: it may be another one by the time that a training has ended
 CODE = named(commit())
@@ -94,7 +97,7 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
         trained = find_finished(cell, folder)
         if trained is None:
             run = find_runs(folder)[-1]
-            if n_steps_of(run / f"{file_stem(cell.env_id)}.zip") >= cell.n_timesteps:
+            if n_steps_of(run, cell.env_id) >= cell.n_timesteps:
                 raise OSError(f"{run} has its last model, but its last checkpoint could not be written: make room for it.")
             raise KeyboardInterrupt
     run, model = trained
@@ -128,30 +131,25 @@ def find_finished(cell: Cell, folder: Path) -> tuple[Path, Model] | None:
     """
     for run in find_runs(folder) if any(folder.rglob(RECORD)) else ():
         record = read_record(run / RECORD)
-        for key in ("env_id", "env_kwargs", "method", "seed", "n_timesteps"):
-            if record[key] != json.loads(json.dumps(getattr(cell, key))):  # which knows no tuples
+        has = {**training_facts(record["hyperparams"], record["arguments"]), **{key: record[key] for key in OF_RUN}}
+        needs = _planned(cell, folder)
+        # What others follow from comes first
+        for key in (*OF_RUN, *sorted({*has, *needs})):
+            if has.get(key) != needs.get(key):
                 raise ValueError(
-                    f"{run} has {key} {record[key]!r}, but {cell.experiment}/{cell.name} needs {getattr(cell, key)!r}: "
-                    f"move this run away, or choose other --runs."
+                    f"{run} has {key} {has.get(key)!r}, but {cell.experiment}/{cell.name} needs {needs.get(key)!r}, as the "
+                    "experiment or the YAML file says: move this run away, or choose other --runs."
                 )
-        has, needs = (training_facts(*of) for of in ((record["hyperparams"], record["arguments"]), _planned(cell, folder)))
-        if different := sorted(key for key in {*has, *needs} if has.get(key) != needs.get(key)):
-            key = different[0]
-            raise ValueError(
-                f"{run} has {key} {has.get(key)!r}, but {cell.experiment}/{cell.name} needs {needs.get(key)!r}, as the YAML "
-                "file or the experiment says: move this run away, or choose other --runs."
-            )
-        # An interrupted training leaves a model, too; and of a finished one, the checkpoints may have been removed
-        model, last = run / f"{file_stem(cell.env_id)}.zip", n_steps_done(run)
-        if n_steps_of(model) >= cell.n_timesteps and (last >= cell.n_timesteps or not last):
+        if is_finished(run, cell.env_id, cell.n_timesteps):
             return run, agent_at(run, "last").load()
     return None
 
 
-def _planned(cell: Cell, folder: Path) -> tuple[dict[str, Any], list[str]]:
-    """Hyperparameters and arguments of the training of a cell, as its record will have them."""
+def _planned(cell: Cell, folder: Path) -> dict[str, Any]:
+    """What the training of a cell is, as its record will say it."""
     method = get_method(cell.method)
     blocks = yaml.safe_load(Path(method.algorithm.settings_file).read_text())
     of_env = {key: value for key, value in blocks.get(cell.env_id, blocks["default"]).items() if key != "method"}
     used = {**merged(method.settings(of_env), cell.settings), "n_timesteps": cell.n_timesteps}
-    return json.loads(json.dumps(used, default=str)), cell.training(folder)
+    facts = {**training_facts(used, cell.training(folder)), **{key: getattr(cell, key) for key in OF_RUN}}
+    return cast(dict[str, Any], json.loads(json.dumps(facts, default=str)))  # which knows no tuples

@@ -78,7 +78,10 @@ def test_a_killed_run_goes_on_and_a_finished_one_is_tested(tmp_path: Path, monke
     assert run_cell(others, tmp_path)
     again = np.load(others.result(tmp_path))
     assert (again["returns_prior"] == raw["returns_prior"]).all() and "returns_belief" not in again
-    with pytest.raises(ValueError, match="seed 1, but other/tiny-n_test_tasks10-seed2 needs 2: move this run away"):
+    with pytest.raises(
+        ValueError,
+        match="seed 1, but other/tiny-n_test_tasks10-seed2 needs 2, as the experiment or the YAML file says: move this run",
+    ):
         find_finished(replace(others, seed=2), folder)
     with pytest.raises(ValueError, match=r"has batch_size 4, but .* needs 5"):
         find_finished(replace(others, settings={**SMALL, "batch_size": 5}), folder)
@@ -154,7 +157,7 @@ def test_a_run_by_another_file_of_settings_is_not_that_of_a_cell(tmp_path: Path)
     blocks = yaml.safe_load(hyperparams_file("pearl.yml").read_text())
     (tmp_path / "mine.yml").write_text(yaml.safe_dump({"default": {**blocks["default"], "kl_coef": 7.0}}))
     assert main([*["train", *cell.training(cell.run_folder(tmp_path))], "-conf", str(tmp_path / "mine.yml")]) == 0
-    with pytest.raises(ValueError, match=r"has kl_coef 7\.0, but one/tiny-seed1 needs None, as the YAML file"):
+    with pytest.raises(ValueError, match=r"has kl_coef 7\.0, but one/tiny-seed1 needs None, as the experiment or the YAML"):
         run_cell(cell, tmp_path)
 
 

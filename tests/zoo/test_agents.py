@@ -275,6 +275,24 @@ def test_the_command_of_a_record_names_settings_that_everybody_has(file: str, op
     assert command == f"sb3-htr train --env {ENV_ID} {option} pearl_prior.yml --method htr-ser-prior --seed 4"
 
 
+def test_a_card_names_all_modules_of_ones_own_at_once() -> None:
+    """Of an option that is given twice, the second one counts."""
+    packages = ["mine", "metaworld", "yours"]
+    record = {"env_id": "Mine-v0", "env_kwargs": {}, "gym_packages": packages, "num_timesteps": 240, "model": "last"}
+    adapted = AdaptationRecord(np.ones((2, 3)), np.ones((2, 3), dtype=bool), np.zeros((2, 3, 1, 1), dtype=np.float32))
+    for repo_id in (None, "me/pearl-Mine-v0"):
+        assert " --gym-packages mine yours\n```" in model_card.model_card(record, {"belief": adapted}, repo_id)
+
+
+def test_a_run_behind_the_modules_is_no_module(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python would import its folder, and the command say that there is no agent."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ValueError, match=r"--gym-packages took 'logs' for a module, and it is a folder"):
+        main(["enjoy", "--no-render", "--gym-packages", "htr_envs", "logs"])
+    assert main(["enjoy", "--gym-packages", "htr_envs", "--no-render", "logs", "--n-tasks", "1", "--n-episodes", "1"]) == 0
+
+
 @pytest.mark.parametrize(
     ("command", "package", "extra"),
     [("train", "rl_zoo3", "zoo"), ("record", "imageio_ffmpeg", "video"), ("plot", "matplotlib", "plots")],

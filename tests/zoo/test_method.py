@@ -267,6 +267,16 @@ def test_what_yaml_makes_of_a_slip(learning_rate: Any, n_timesteps: Any, more: s
     assert "\n" not in str(refusal.value) and not (tmp_path / "logs").exists()
 
 
+def test_keywords_that_are_left_empty_are_none(tmp_path: Path) -> None:
+    block: dict[str, Any] = {key: value for key, value in TINY.items() if key != "seed"}
+    block |= {"policy": "MlpPolicy", "n_timesteps": 240, "n_envs": 4, "replay_buffer_kwargs": None, "env_kwargs": None}
+    (tmp_path / "my.yml").write_text(yaml.safe_dump({ENV_ID: block}))
+    arguments = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(tmp_path / "my.yml"), "--eval-freq", "-1"]
+    for number, more in enumerate(([], ["-params", "env_kwargs:None"]), start=1):
+        assert main([*arguments, "--verbose", "0", *more]) == 0
+        assert json.loads((run_folder(tmp_path, number=number) / RECORD).read_text())["env_kwargs"] == {}
+
+
 def test_keywords_may_be_python_where_the_file_is_trusted(tmp_path: Path) -> None:
     block = {key: value for key, value in TINY.items() if key not in ("seed", "policy_kwargs")}
     block |= {"policy": "MlpPolicy", "n_timesteps": 240, "n_envs": 4, "learning_rate": "lin_1e-3"}

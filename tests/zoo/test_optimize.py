@@ -22,11 +22,10 @@ from sb3_htr import PEARL
 from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.commands import optimize, train
-from sb3_htr.zoo.commands.optimize import without_password
 from sb3_htr.zoo.run.manager import MetaExperimentManager
 from sb3_htr.zoo.run.method import PEARLMethod, get_method, merged, methods
 from sb3_htr.zoo.run.search_space import ENCODER_ARCHS, convert_pearl_params, sample_pearl_params
-from sb3_htr.zoo.run.storage import absolute
+from sb3_htr.zoo.run.storage import absolute, without_password
 
 SMALL = ["-params", "n_tasks_per_rollout:4", "n_episodes_per_task:3", "learning_starts:240", "n_envs:4"]
 
@@ -307,11 +306,14 @@ def test_where_the_report_cannot_go_is_said_before_the_search(quick: None, tmp_p
 def test_a_study_is_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path)
-    for storage in ("sqlite:///study.db", "journals/study.log"):
+    for storage in ("sqlite:///study.db", "sqlite:///study.db?timeout=60", "journals/study.log"):
         whole = absolute(storage)
         assert whole.endswith(f"{tmp_path}/{storage.removeprefix('sqlite:///')}") and absolute(whole) == whole
-    for storage in ("sqlite:///:memory:", "postgresql+psycopg://user@host/database"):
+    for storage in ("sqlite:///:memory:", "sqlite://", "postgresql+psycopg://user:secret@host/database"):
         assert absolute(storage) == storage
     with pytest.raises(ValueError, match=r"there is no file .*study\.db: give that of `sb3-htr optimize`"):
         main(["train", "--env", ENV_ID, "--storage=sqlite:///study.db", "--study-name", "test", "--trial-id", "0"])
     assert not Path("study.db").exists()
+    optimize.create_study("sqlite:///study.db?timeout=60", "test")
+    with pytest.raises(ValueError, match=r"study\.db\?timeout=60 has no study 'test' with a trial 0"):
+        main(["train", "--env", ENV_ID, "--storage=sqlite:///study.db?timeout=60", "--study-name", "test", "--trial-id", "0"])

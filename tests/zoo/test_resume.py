@@ -23,7 +23,7 @@ from helpers import parameters as model_parameters
 from helpers.runs import run_folder
 from sb3_htr import PEARL
 from sb3_htr.common.checkpoint import write_checkpoint
-from sb3_htr.common.resume import checkpoints, cut_monitor_files
+from sb3_htr.common.resume import checkpoints, cut_monitor_files, load_latest
 from sb3_htr.common.versions import named
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run.manager import MetaExperimentManager
@@ -150,6 +150,25 @@ def test_training_further_is_as_if_it_had_been_planned(tmp_path: Path, capsys: p
     assert main(["train", "--resume", str(run)]) == 0
     output = capsys.readouterr().out
     assert f"{run} is finished, after 960 env steps." in output and f"sb3-htr train --resume {run} -n 1" in output
+
+
+def test_the_evaluation_at_the_end_of_a_short_training_is_in_its_checkpoint(tmp_path: Path) -> None:
+    """Training further, it would be forgotten, and a worse model be the best one."""
+    arguments = [word if word != str(STEPS) else "480" for word in TRAIN]
+    assert main([*arguments, "--eval-freq", "960", "-f", str(tmp_path)]) == 0
+    run = run_folder(tmp_path)
+    with np.load(run / "evaluations.npz") as file:
+        first = dict(file)
+    assert main(["train", "--resume", str(run), "-n", "480"]) == 0
+    with np.load(run / "evaluations.npz") as file:
+        assert file["timesteps"].tolist() == [480, 960]
+        np.testing.assert_array_equal(file["returns"][:1], first["returns"])
+        best = file["results"].mean(axis=1).max()
+    _, state = load_latest(run)
+    (of_evaluations,) = (of["state"] for of in state["callbacks"] if "best_mean_reward" in (of["state"] or {}))
+    assert of_evaluations["best_mean_reward"] == pytest.approx(best)
+    progress = np.genfromtxt(run / "progress.csv", delimiter=",", names=True, deletechars="")
+    assert progress["time/total_timesteps"][np.isfinite(progress["eval/mean_reward"])].tolist() == [480, 960]
 
 
 def test_a_learning_rate_decays_anew_when_training_further(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import gymnasium as gym
 import imageio.v3 as iio
 import numpy as np
 import pytest
+import torch as th
 
 from helpers import ENV_ID, MakePEARL
 from helpers.disks import disk
@@ -14,7 +15,8 @@ from helpers.runs import NOWHERE, SHIPPED, make_run
 from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.show.captions import Captioner
-from sb3_htr.zoo.show.play import Moment, Player
+from sb3_htr.zoo.show.film import Film
+from sb3_htr.zoo.show.play import Camera, Moment, Player
 from sb3_htr.zoo.show.window import Window
 
 
@@ -97,6 +99,18 @@ def test_what_is_played_is_what_is_evaluated(explorer: str) -> None:
     assert moments[-1].deviation <= before[0] > 0.1 and (explorer != "prior" or set(before) == {1.0})
 
 
+def test_sampled_actions_are_those_of_an_evaluation_and_of_nobody_else() -> None:
+    """They are not drawn with the numbers that z is drawn with."""
+    model, env = PEARL.load(SHIPPED), gym.make(ENV_ID)
+    tasks = env.unwrapped.task_family.test_tasks  # type: ignore[attr-defined]
+    returns, _ = evaluate_adaptation(model, env, tasks[:2], n_episodes=3, deterministic=False, seed=3)
+    before = th.get_rng_state()
+    player = Player(model, env, deterministic=False, seed=3)
+    played = [list(player.play(tasks, number, 3))[-1].returns for number in (1, 2)]
+    np.testing.assert_allclose(played, returns, atol=1e-5)
+    assert th.equal(th.get_rng_state(), before)
+
+
 class Deaf(gym.Wrapper):
     """Passes no options on."""
 
@@ -107,7 +121,7 @@ class Deaf(gym.Wrapper):
 def test_another_task_than_was_asked_for_is_not_played() -> None:
     env = gym.make(ENV_ID)
     tasks = env.unwrapped.task_family.test_tasks  # type: ignore[attr-defined]
-    with pytest.raises(ValueError, match=r"The env was asked for the task .*, and is on"):
+    with pytest.raises(ValueError, match=r"Env 0 was asked for the task .*, and is on"):
         next(Player(PEARL.load(SHIPPED), Deaf(env)).play(tasks, 1, 1))
 
 
@@ -135,6 +149,42 @@ def test_films_that_cannot_be_made(tmp_path: Path, tiny_pearl: MakePEARL, monkey
     with pytest.raises(ValueError, match="A gif holds at most 5 frames"):
         main(["record", *NOWHERE, "-o", str(tmp_path / "film.gif"), "--verbose", "0"])
     assert not list(tmp_path.iterdir()), "no half of a film is left"
+
+
+class Draws(gym.Wrapper):
+    """Something else than its env."""
+
+    picture: Any = None
+
+    def render(self) -> Any:
+        return self.picture
+
+
+@pytest.mark.parametrize(
+    ("picture", "what"),
+    [
+        (None, "None"),
+        ([[0, 0, 0]], "a list"),
+        (np.zeros((8, 8, 3)), r"an array of shape \(8, 8, 3\) of float64"),
+        (np.zeros((8, 8), dtype=np.uint8), r"an array of shape \(8, 8\) of uint8"),
+        (np.zeros((8, 8, 4), dtype=np.uint8), r"an array of shape \(8, 8, 4\) of uint8"),
+    ],
+)
+def test_an_env_that_draws_no_picture_is_told_what_one_is(picture: Any, what: str) -> None:
+    env = Draws(gym.make(ENV_ID))
+    env.picture = picture
+    with pytest.raises(ValueError, match=rf"render\(\) gave {what}, expected a picture \(height, width, 3\) of uint8"):
+        Camera(env, 1).reset()
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+def test_pictures_of_a_film_are_of_one_size(suffix: str, tmp_path: Path) -> None:
+    """As many bytes would make a broken film."""
+    film = Film(tmp_path / f"film{suffix}", 10)
+    film.add(np.zeros((40, 60, 3), dtype=np.uint8), 0.0)
+    with pytest.raises(ValueError, match="A picture of the film has 40 x 60 pixels, expected 60 x 40 as the first one"):
+        film.add(np.zeros((60, 40, 3), dtype=np.uint8), 0.0)
+    film.close()
 
 
 def test_a_film_on_a_full_disk_is_no_film(tmp_path: Path, tiny_pearl: MakePEARL, capfd: pytest.CaptureFixture[str]) -> None:

@@ -90,7 +90,7 @@ def add_adaptation_arguments(parser: argparse.ArgumentParser, n_episodes: int) -
     explorers = f"{', '.join(EXPLORERS)}, or one of your own; by default the model's"
     group.add_argument("--explorer", metavar="NAME", help=explorers)
     group.add_argument("--stochastic", action="store_true", help="sample actions instead of taking their mean")
-    group.add_argument("--seed", type=int, default=0, help="of env and z (default: 0)")
+    group.add_argument("--seed", type=int, default=0, help="of env, z and sampled actions (default: 0)")
 
 
 def chosen_agent(parser: argparse.ArgumentParser, args: argparse.Namespace, path: Path | None) -> TrainedAgent:

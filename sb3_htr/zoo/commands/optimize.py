@@ -6,14 +6,12 @@ import logging
 import shlex
 import time
 from collections.abc import Sequence
-from pathlib import Path
 
 import optuna
 import sqlalchemy
-from optuna.storages import JournalStorage
-from optuna.storages.journal import JournalFileBackend
 
 from sb3_htr.zoo.commands import train
+from sb3_htr.zoo.run.storage import opened, url_of, without_password
 
 HELP = """sb3-htr optimize: rl_zoo3's `train -optimize` (its arguments follow) for PEARL, with Optuna.
 
@@ -40,31 +38,21 @@ def create_study(storage: str, name: str) -> optuna.Study:
     """
     Make the study if there is none yet, several workers at once if need be.
 
-    :param storage: file of a journal (``.log``), or URL of a database
+    :param storage: file of a journal, or URL of a database
     :param name: of the study
     :return: the study
     :raises ValueError: if the database cannot be used
     """
-    if storage.endswith(".log"):
-        Path(storage).parent.mkdir(parents=True, exist_ok=True)
-        journal = JournalStorage(JournalFileBackend(storage))
-        return optuna.create_study(study_name=name, storage=journal, direction="maximize", load_if_exists=True)
-    try:
-        url = sqlalchemy.make_url(storage)
-    except sqlalchemy.exc.ArgumentError:
-        raise ValueError(
-            f"--storage is {storage!r}, expected sqlite:///FILE, postgresql+psycopg://USER:PASSWORD@HOST/DATABASE or FILE.log."
-        ) from None
-    if url.get_backend_name() == "postgresql":
+    if (url := url_of(storage)) is not None and url.get_backend_name() == "postgresql":
         importlib.import_module(url.get_driver_name())
     attempt = 1
     while True:
         try:
-            return optuna.create_study(study_name=name, storage=storage, direction="maximize", load_if_exists=True)
+            return optuna.create_study(study_name=name, storage=opened(storage), direction="maximize", load_if_exists=True)
         except sqlalchemy.exc.SQLAlchemyError as error:
             if attempt == ATTEMPTS:
                 reason = " ".join(str(getattr(error, "orig", None) or error).split())
-                raise ValueError(f"The storage {url.render_as_string()} cannot be used: {reason}") from None
+                raise ValueError(f"The storage {without_password(storage)} cannot be used: {reason}") from None
         time.sleep(PAUSE * attempt)
         attempt += 1
 
@@ -115,15 +103,6 @@ def main(argv: Sequence[str]) -> None:
         for option, values in {**given, "-params": args.hyperparams}.items():
             command += [option, *values] if values else []
         print(f"Train with the best trial so far: {shlex.join(command)}")
-
-
-def without_password(storage: str) -> str:
-    """
-    :param storage: file of a journal (``.log``), or URL of a database
-    :return: the same, with *** in place of a password
-    """
-    url = None if storage.endswith(".log") else sqlalchemy.make_url(storage)
-    return storage if url is None or url.password is None else url.render_as_string()
 
 
 def _is_news(record: logging.LogRecord) -> bool:

@@ -228,11 +228,11 @@ def main(argv: Sequence[str]) -> None:
 
     if "learning" in args.only:
         learning = {label: curve for label, agents in groups.items() if (curve := learning_curve(label, agents)) is not None}
-        labels = ("return of the last adaptation episode", "share of tasks solved (%)")
         if learning:
             names = [agent.explorer for agents in groups.values() for agent in agents]
             about = f"{env_id}, validation tasks, {about_explorers(names)}"
-            plot_curves(learning, new("learning_curves"), about, "thousand env steps of meta-training", labels)
+            x_label, y_label = "thousand env steps of meta-training", "return of the last adaptation episode"
+            plot_curves(learning, new("learning_curves"), about, x_label, y_label)
             print_time_to_learned(groups)
         else:
             print("No learning curves: there is no evaluations.npz of a training.")
@@ -268,8 +268,7 @@ def plot_adapted(
                 returns = np.stack([run.record.returns.mean(axis=0) for run in runs])
                 successes = np.stack([run.record.successes.mean(axis=0) for run in runs])
                 curves[name] = Curve(np.arange(1, args.n_episodes + 1), returns, successes, method_of[name])
-            labels = ("return", "share of tasks solved (%)")
-            plot_curves(curves, new("adaptation_curve"), about, "adaptation episode", labels)
+            plot_curves(curves, new("adaptation_curve"), about, "adaptation episode", "return")
     if "paths" in args.only and first.record.achieved.shape[-1] == 2:
         # The label of --env is the env
         title = ", ".join(dict.fromkeys((env_id, label, f"{args.tasks} tasks", f"explorer {first.explorer}")))

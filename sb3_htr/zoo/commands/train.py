@@ -12,7 +12,7 @@ import gymnasium as gym
 
 from htr_envs.goal_env import find_hidden
 from sb3_htr.common.resume import n_steps_done
-from sb3_htr.zoo.run.agents import OF_TRAINING, RECORD, file_stem, find_run, n_steps_of, read_record
+from sb3_htr.zoo.run.agents import OF_TRAINING, RECORD, find_run, is_finished, n_steps_of, read_record
 from sb3_htr.zoo.run.defaults import default_arguments, given_arguments, value_of
 from sb3_htr.zoo.run.malloc import keep_freed_memory
 from sb3_htr.zoo.run.manager import run_rl_zoo
@@ -85,14 +85,12 @@ def main(argv: Sequence[str]) -> None:
         if not {*OF_TRAINING} <= record.keys():
             raise ValueError(f"{run} is no run of sb3-htr train, so there is nothing to go on with: give the folder of one.")
         planned = record["n_timesteps"] + further.n_timesteps
-        # An interrupted training leaves a model, too, and so does one that goes on; of a finished one, the checkpoints may
-        # have been removed
-        done, trained = n_steps_done(run), n_steps_of(run / f"{file_stem(record['env_id'])}.zip")
-        if trained >= planned and (done >= planned or not done):
+        if is_finished(run, record["env_id"], planned):
+            done = n_steps_done(run)
             to_go_on = shlex.join(["sb3-htr", "train", "--resume", str(run), "-n", str(done - record["n_timesteps"] + 1)])
             further_on = f"To train further, by so many steps or more: {to_go_on}"
             print(
-                f"{run} is finished, after {trained:,} env steps. "
+                f"{run} is finished, after {n_steps_of(run, record['env_id']):,} env steps. "
                 + (further_on if done else "Its checkpoints were removed, so it cannot be trained further.")
             )
             return

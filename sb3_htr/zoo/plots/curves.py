@@ -62,7 +62,7 @@ class Curve(NamedTuple):
     method: str
 
 
-def plot_curves(curves: dict[str, Curve], path: Path, title: str, x_label: str, y_labels: tuple[str, str]) -> None:
+def plot_curves(curves: dict[str, Curve], path: Path, title: str, x_label: str, y_label: str) -> None:
     """
     Left: returns. Right: tasks solved.
 
@@ -70,7 +70,7 @@ def plot_curves(curves: dict[str, Curve], path: Path, title: str, x_label: str, 
     :param path: picture to write
     :param title: of the figure
     :param x_label: of both axes
-    :param y_labels: of returns and successes
+    :param y_label: of returns
     """
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4.2), layout="constrained")
     styles = curve_styles([curve.method for curve in curves.values()])
@@ -79,9 +79,10 @@ def plot_curves(curves: dict[str, Curve], path: Path, title: str, x_label: str, 
         band(left, curve.x, curve.returns, colour, style, label)
         band(right, curve.x, 100 * curve.successes, colour, style, label)
     right.set_ylim(-4, 104)
-    for axes, y_label in zip((left, right), y_labels, strict=True):
+    left.set_ylabel(y_label)
+    right.set_ylabel("share of tasks solved (%)")
+    for axes in (left, right):
         axes.set_xlabel(x_label)
-        axes.set_ylabel(y_label)
         axes.xaxis.get_major_locator().set_params(integer=True)
     span_unit_if_flat(left)
     # Of three seeds and fewer, the IQM is the mean, and of two its bootstrap interval their range

@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr.common.checks import check_device
 from sb3_htr.common.errors import last_line
-from sb3_htr.common.resume import checkpoints
+from sb3_htr.common.resume import checkpoints, n_steps_done
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.zoo.run.algorithm import Algorithm, Model
 from sb3_htr.zoo.run.folder import run_number
@@ -152,16 +152,30 @@ def file_stem(env_id: str) -> str:
     return env_id.rpartition(":")[2].replace("/", "-")
 
 
-def n_steps_of(model: Path) -> int:
+def n_steps_of(run: Path, env_id: str) -> int:
     """
-    :param model: file
-    :return: env steps that it was trained for, 0 if there is no such file, or it does not say
+    :param run: run folder
+    :param env_id: env that it was trained on
+    :return: env steps that its last model was trained for, 0 if there is none, or it does not say
     """
     try:
-        with zipfile.ZipFile(model) as archive:
+        with zipfile.ZipFile(run / f"{file_stem(env_id)}.zip") as archive:
             return int(json.loads(archive.read("data"))["num_timesteps"])
     except (OSError, zipfile.BadZipFile, KeyError, TypeError, ValueError):
         return 0
+
+
+def is_finished(run: Path, env_id: str, n_timesteps: int) -> bool:
+    """
+    :param run: run folder
+    :param env_id: env that it was trained on
+    :param n_timesteps: env steps that are planned
+    :return: whether it was trained to its end
+    """
+    # An interrupted training leaves a model, too, and so does one that goes on; of a finished one, the checkpoints may have
+    # been removed
+    done = n_steps_done(run)
+    return n_steps_of(run, env_id) >= n_timesteps and (done >= n_timesteps or not done)
 
 
 def read_record(path: Path, content: bytes | None = None) -> dict[str, Any]:

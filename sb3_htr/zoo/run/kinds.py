@@ -8,10 +8,11 @@ SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf")
 MAY_BE_TEXT = ("policy_kwargs",)
 
 
-def check_kinds(hyperparams: dict[str, Any], file: object) -> None:
+def checked_kinds(hyperparams: dict[str, Any], file: object) -> dict[str, Any]:
     """
     :param hyperparams: settings
     :param file: where they come from, for messages
+    :return: the same, without keywords that are left empty
     :raises ValueError: for a text that was to be a number, as 1e-3 is to YAML, and for keywords that are none
     """
     for name, value in hyperparams.items():
@@ -22,6 +23,7 @@ def check_kinds(hyperparams: dict[str, Any], file: object) -> None:
             raise ValueError(
                 f"{name} is the text {value!r} ({file}), expected a number: in YAML, 1.0e-3 is one, and 1e-3 is not."
             )
+    return {name: value for name, value in hyperparams.items() if value is not None or not name.endswith("kwargs")}
 
 
 def _is_linear(text: str) -> bool:

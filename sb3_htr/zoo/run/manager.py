@@ -23,8 +23,6 @@ from typing import Any, cast
 import optuna
 import rl_zoo3.train
 import yaml
-from optuna.storages import JournalStorage
-from optuna.storages.journal import JournalFileBackend
 from rl_zoo3 import exp_manager
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
@@ -53,11 +51,11 @@ from sb3_htr.zoo.run.algorithm import Algorithm
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback, ProgressCallback
 from sb3_htr.zoo.run.defaults import given_arguments
 from sb3_htr.zoo.run.folder import SystemLock, claim, lock
-from sb3_htr.zoo.run.kinds import check_kinds
+from sb3_htr.zoo.run.kinds import checked_kinds
 from sb3_htr.zoo.run.method import DEFAULT, PEARLMethod, get_method, merged, names_of
 from sb3_htr.zoo.run.search_space import convert_pearl_params, sample_pearl_params
 from sb3_htr.zoo.run.shipped import find_hyperparams
-from sb3_htr.zoo.run.storage import check_is_there
+from sb3_htr.zoo.run.storage import check_is_there, opened
 from sb3_htr.zoo.run.trust import PACKAGES, check_arguments, plain_settings, refuse
 
 # What a YAML file may have beside the arguments of the algorithm
@@ -109,8 +107,7 @@ class MetaExperimentManager(ExperimentManager):
         if self.optimize_hyperparameters and not isinstance(self.method, PEARLMethod):
             raise ValueError(f"The search is for settings of PEARL, and {self.method.name} has none: choose another --method.")
         checked = partial(plain_settings, trust=self.trust, named=self.args.gym_packages)
-        hyperparams = checked(hyperparams, self.config)
-        check_kinds(hyperparams, self.config)
+        hyperparams = checked_kinds(checked(hyperparams, self.config), self.config)
         if (otherwise := self.method.set_otherwise(hyperparams)) and self.resumed is None:
             warnings.warn(
                 f"{self.config} has {', '.join(otherwise)}, which the method {self.method.name} replaces by its own: to have "
@@ -127,7 +124,7 @@ class MetaExperimentManager(ExperimentManager):
             raise ValueError(
                 f"{self.config} has no {' and no '.join(missing)} for {self.env_name}: add it, as pearl.yml has it."
             )
-        check_kinds(hyperparams, self.config)
+        hyperparams = checked_kinds(hyperparams, self.config)
         saved = OrderedDict(sorted(hyperparams.items()))
         print(f"Method {self.method.name}: {self.config} has the settings of the env. With those of the command line:")
         pprint(dict(saved))
@@ -136,9 +133,8 @@ class MetaExperimentManager(ExperimentManager):
     def _check_study(self) -> None:
         """Trials of several envs, methods or budgets have no best one, and settings of one are none of another."""
         assert self.storage is not None
-        storage = JournalStorage(JournalFileBackend(self.storage)) if self.storage.endswith(".log") else self.storage
         try:
-            study = optuna.load_study(study_name=self.study_name, storage=storage)
+            study = optuna.load_study(study_name=self.study_name, storage=opened(self.storage))
         except KeyError:  # it is said elsewhere that there is none
             return
         facts: dict[str, Any] = {"env": str(self.env_name.gym_id), "method": self.method.name}
@@ -268,7 +264,10 @@ class MetaExperimentManager(ExperimentManager):
         self.callbacks.append(ProgressCallback(Path(self.save_path) / "progress.csv"))
         self._checkpointing = next((call for call in self.callbacks if isinstance(call, CheckpointCallback)), None)
         if self._checkpointing is not None:
-            self._checkpointing.companions = [call for call in self.callbacks if call is not self._checkpointing]
+            self.callbacks.remove(self._checkpointing)
+            self._checkpointing.companions = list(self.callbacks)
+            # Behind the evaluation at the end of a training, and before the file of the progress is closed
+            self.callbacks.insert(-1, self._checkpointing)
 
     def learn(self, model: BaseAlgorithm) -> None:
         """

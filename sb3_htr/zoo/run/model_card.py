@@ -140,7 +140,8 @@ def model_card(record: dict[str, Any], scores: dict[str, AdaptationRecord], repo
     algorithm = (method or get_method(DEFAULT)).algorithm
     model = model_name(env_id, algorithm.name)
     file = f"{model}.zip"
-    own = "".join(f" --gym-packages {package}" for package in record["gym_packages"] or () if package not in PACKAGES)
+    own = " ".join(package for package in record["gym_packages"] or () if package not in PACKAGES)
+    own = own and f" --gym-packages {own}"
     watch = f"sb3-htr enjoy {file}{own}"
     path = f'"{file}"'
     if repo_id is not None:

@@ -2,15 +2,45 @@
 
 from pathlib import Path
 
-SQLITE = "sqlite:///"
+import sqlalchemy
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
+
+
+def url_of(storage: str) -> sqlalchemy.URL | None:
+    """
+    :param storage: as given
+    :return: URL of a database, None for a journal
+    :raises ValueError: if it is neither
+    """
+    if storage.endswith(".log"):
+        return None
+    try:
+        return sqlalchemy.make_url(storage)
+    except sqlalchemy.exc.ArgumentError:
+        raise ValueError(
+            f"--storage is {storage!r}, expected sqlite:///FILE, postgresql+psycopg://USER:PASSWORD@HOST/DATABASE or FILE.log."
+        ) from None
+
+
+def opened(storage: str) -> JournalStorage | str:
+    """
+    :param storage: as given
+    :return: for Optuna
+    :raises ValueError: if it is neither journal nor database
+    """
+    if url_of(storage) is not None:
+        return storage
+    Path(storage).parent.mkdir(parents=True, exist_ok=True)
+    return JournalStorage(JournalFileBackend(storage))
 
 
 def _file(storage: str) -> str | None:
     """The file of a journal or of SQLite; None for a server, and for what is kept in memory."""
-    if storage.endswith(".log"):
+    url = url_of(storage)
+    if url is None:
         return storage
-    name = storage.removeprefix(SQLITE)
-    return None if name == storage or name in ("", ":memory:") else name
+    return url.database if url.get_backend_name() == "sqlite" and url.database not in ("", ":memory:") else None
 
 
 def absolute(storage: str) -> str:
@@ -18,8 +48,11 @@ def absolute(storage: str) -> str:
     :param storage: as given
     :return: the same from any folder
     """
-    file = _file(storage)
-    return storage if file is None else storage.removesuffix(file) + str(Path(file).resolve())
+    file, url = _file(storage), url_of(storage)
+    if file is None:
+        return storage
+    whole = str(Path(file).resolve())
+    return whole if url is None else url.set(database=whole).render_as_string()
 
 
 def check_is_there(storage: str) -> None:
@@ -30,3 +63,12 @@ def check_is_there(storage: str) -> None:
     file = _file(storage)
     if file is not None and not Path(file).exists():
         raise ValueError(f"--storage is {storage}, and there is no file {file}: give that of `sb3-htr optimize`.")
+
+
+def without_password(storage: str) -> str:
+    """
+    :param storage: as given
+    :return: the same, with *** in place of a password
+    """
+    url = url_of(storage)
+    return storage if url is None or url.password is None else url.render_as_string()

@@ -147,7 +147,7 @@ def import_packages(named: Iterable[str], asked_for: Iterable[str] = (), file: o
     :param asked_for: the same, by a file
     :param file: for messages
     :param trust: whether the file may have code run
-    :raises ValueError: for one that is not there, or that a file may not have imported
+    :raises ValueError: for one that is not there or is a mere folder, or that a file may not have imported
     """
     named = list(named)
     if named or trust:
@@ -164,10 +164,15 @@ def import_packages(named: Iterable[str], asked_for: Iterable[str] = (), file: o
                 "and work in its folder, or add that to PYTHONPATH."
             )
         try:
-            importlib.import_module(name)
+            module = importlib.import_module(name)
         except ModuleNotFoundError as error:
             if error.name != name.split(".")[0]:
                 raise
             raise ValueError(
                 f"The module {name} is asked for, but not found: install it, or add its folder to PYTHONPATH."
             ) from None
+        if hasattr(module, "__path__") and getattr(module, "__file__", None) is None:
+            raise ValueError(
+                f"--gym-packages took {name!r} for a module, and it is a folder without __init__.py: if it is a run, give it "
+                "before that option, or with another option between them."
+            )

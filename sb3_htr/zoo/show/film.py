@@ -18,26 +18,34 @@ class Film:
     A file that is being filmed; an mp4 is written as it comes in, a gif at the end.
 
     :param path: file to write, ``.mp4`` or ``.gif``
-    :param fps: frames per second of an mp4
+    :param fps: frames per second
     """
 
     def __init__(self, path: Path, fps: float) -> None:
         self.path, self.fps = path, fps
         self.seconds: list[float] = []
         self._frames: list[np.ndarray] = []
+        self._size: tuple[int, ...] | None = None
         self._ffmpeg: Generator[None, np.ndarray | None, None] | None = None
 
     def add(self, frame: np.ndarray, hold: float) -> None:
         """
         :param frame: (height, width, 3) uint8, the sides even numbers
         :param hold: seconds that it is shown longer than others
-        :raises ValueError: for a gif that would not fit into memory
+        :raises ValueError: for a frame of another size than the first one, and a gif that would not fit into memory
         """
+        size = frame.shape[1::-1]
+        self._size = self._size or size
+        if size != self._size:
+            given, expected = (f"{width} x {height}" for width, height in (size, self._size))
+            raise ValueError(
+                f"A picture of the film has {given} pixels, expected {expected} as the first one: let render() of the env "
+                "give pictures of one size."
+            )
         self.seconds.append(1 / self.fps + hold)
         if self.path.suffix == ".mp4":
             if self._ffmpeg is None:
                 # Sides need not be multiples of 16 for today's players
-                size = frame.shape[1::-1]
                 self._ffmpeg = imageio_ffmpeg.write_frames(self.path, size, fps=self.fps, quality=7, macro_block_size=2)
                 self._ffmpeg.send(None)
             for _ in range(round(self.seconds[-1] * self.fps)):

@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_htr.adaptation.evaluation import MetaLearner
 from sb3_htr.adaptation.loop import adaptation_steps
+from sb3_htr.common.random_state import seeded_actions
 from sb3_htr.common.vec_env import reset_to_tasks
 
 
@@ -59,7 +60,7 @@ class Camera(gym.Wrapper):
         super().__init__(env)
         self.every = every
         # Since they were taken away: those of a step that ends an episode, and of the reset that follows, are two
-        self.frames: list[Any] = []
+        self.frames: list[np.ndarray | None] = []
         self._n_steps = 0
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
@@ -76,14 +77,24 @@ class Camera(gym.Wrapper):
 
     def _take(self, ended: bool) -> None:
         taken = self.every > 0 and (ended or self._n_steps % self.every == 0)
-        self.frames.append(self.env.render() if taken else None)
+        self.frames.append(self._picture() if taken else None)
+
+    def _picture(self) -> np.ndarray:
+        frame: Any = self.env.render()
+        if not (isinstance(frame, np.ndarray) and frame.shape[2:] == (3,) and frame.dtype == np.uint8):
+            what = "None" if frame is None else f"a {type(frame).__name__}"
+            if isinstance(frame, np.ndarray):
+                what = f"an array of shape {frame.shape} of {frame.dtype}"
+            raise ValueError(
+                f"The env's render() gave {what}, expected a picture (height, width, 3) of uint8: make it return one."
+            )
+        return frame
 
     def next_frame(self) -> np.ndarray | None:
         """
         :return: the oldest frame that was not taken away yet
         """
-        frame: np.ndarray | None = self.frames.pop(0)
-        return frame
+        return self.frames.pop(0)
 
 
 class Player:
@@ -94,7 +105,7 @@ class Player:
     :param env: single env of its task family
     :param explorer: name of the explorer, the model's own by default
     :param deterministic: mean actions instead of samples
-    :param seed: of env and z
+    :param seed: of env, z and sampled actions; the random state of others is left alone
     :param every: takes every N-th frame of an episode, and the last one; 0 takes none
     :param around: puts wrappers around the VecEnv that the env is in
     """
@@ -109,13 +120,11 @@ class Player:
         every: int = 0,
         around: Callable[[VecEnv], VecEnv] = lambda env: env,
     ) -> None:
-        self.model, self.explorer, self.deterministic = model, explorer, deterministic
+        self.model, self.explorer, self.deterministic, self.seed = model, explorer, deterministic, seed
         self.camera = Camera(env, every)
         self.vec_env = around(DummyVecEnv([lambda: self.camera]))
         self.vec_env.seed(seed)
         self.generator = th.Generator().manual_seed(seed)
-        # Of sampled actions
-        th.manual_seed(seed)
 
     def play(self, tasks: np.ndarray, number: int, n_episodes: int) -> Iterator[Moment]:
         """
@@ -126,6 +135,11 @@ class Player:
         :param n_episodes: adaptation episodes
         :return: each reset and step
         """
+        # As an evaluation in one env
+        with seeded_actions((self.seed, number - 1), self.deterministic):
+            yield from self._play(tasks, number, n_episodes)
+
+    def _play(self, tasks: np.ndarray, number: int, n_episodes: int) -> Iterator[Moment]:
         policy, env = self.model.policy, self.vec_env
         adaptation = self.model.start_adaptation(1, self.explorer, self.generator)
         returns: list[float] = []
