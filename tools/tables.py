@@ -14,7 +14,7 @@ DOCUMENTS = (RESULTS.parent / "README.md", RESULTS.parent / "docs" / "results.md
 HEADLINE = {
     "point_robot": ("htr-ser", "pearl-dense", "pearl-sparse"),
     "prior": ("htr-ser-prior", "pearl-dense-prior"),
-    "wheeled": ("htr-ser", "pearl-dense"),
+    "wheeled": ("htr-ser", "pearl-dense", "pearl-sparse"),
     "ant": ("htr-ser",),
     "fetch_reach": ("htr-ser", "pearl-sparse"),
     "fetch_push": ("htr-ser", "pearl-sparse"),
@@ -83,8 +83,7 @@ def table(summary: dict[str, Any]) -> str:
 def _score(rows: dict[str, dict[str, Any]], metric: str) -> str:
     if metric not in rows:
         return ""
-    row = rows[metric]
-    return f"{row['iqm']:.2f} [{row['low']:.2f}, {row['high']:.2f}]"
+    return _numbers(rows[metric], 2)
 
 
 def _both(rows: dict[str, dict[str, Any]]) -> str:
@@ -121,7 +120,7 @@ def headline(summaries: dict[str, dict[str, Any]]) -> str:
     for name, methods in HEADLINE.items():
         scores: dict[tuple[str, ...], dict[tuple[str, str], str]] = {}
         for row in summaries.get(name, {"rows": []})["rows"]:
-            if row["variant"] in methods and not row.get("tested_on"):
+            if row["variant"] in methods and not row.get("tested_on") and (row["explorer"], row["metric"]) in shown:
                 key = (row["env"], f"{row['env_steps']:,}", str(row["n_seeds"]), row["variant"])
                 scores.setdefault(key, {})[row["explorer"], row["metric"]] = _interval(row)
         lines += [[*key, *(cells.get(column, "") for column in shown)] for key, cells in scores.items()]
@@ -131,7 +130,13 @@ def headline(summaries: dict[str, dict[str, Any]]) -> str:
 def _interval(row: dict[str, Any]) -> str:
     if row["metric"] == "success_rate":
         return f"{row['iqm']:.0%} [{row['low']:.0%}, {row['high']:.0%}]"
-    return f"{row['iqm']:.1f} [{row['low']:.1f}, {row['high']:.1f}]"
+    return _numbers(row, 1)
+
+
+def _numbers(row: dict[str, Any], digits: int) -> str:
+    # Adding 0 turns -0 into 0
+    iqm, low, high = (f"{round(row[key], digits) + 0.0:.{digits}f}" for key in ("iqm", "low", "high"))
+    return f"{iqm} [{low}, {high}]"
 
 
 def filled(text: str, tables: dict[str, str]) -> str:
