@@ -67,8 +67,9 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
         data, weights = read_model(path, ("policy", "knowledge"))
         settings: dict[str, Any] = {name: _plain(data[name]) for name in EXPLORERS}
         settings |= {name: data[name] for name in NUMBERS if type(data.get(name)) in (int, float)}
-        if pickled := [name for name in NUMBERS[1:] if PICKLED in str(data.get(name)) and name not in WORDS]:
-            warnings.warn(f"{pickled[0]} is in {path} as no plain number, and is left at its default.", stacklevel=2)
+        # A schedule may be one that is read below; no other number is an object
+        for name in [name for name in NUMBERS if isinstance(data.get(name), dict) and name != "learning_rate"]:
+            warnings.warn(f"{name} is in {path} as no plain number, and is left at its default.", stacklevel=2)
         settings |= {name: data[name] for name, words in WORDS.items() if re.fullmatch(words, str(data.get(name)))}
         settings |= _schedule(data.get("learning_rate"))
         replay = data.get("replay_buffer_kwargs")
