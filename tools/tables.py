@@ -15,7 +15,7 @@ HEADLINE = {
     "point_robot": ("htr-ser", "pearl-dense", "pearl-sparse"),
     "prior": ("htr-ser-prior", "pearl-dense-prior"),
     "wheeled": ("htr-ser", "pearl-dense", "pearl-sparse"),
-    "ant": ("htr-ser",),
+    "ant": ("htr-ser", "pearl-dense"),
     "fetch_reach": ("htr-ser", "pearl-sparse"),
     "fetch_push": ("htr-ser", "pearl-sparse"),
     "point_maze": ("htr-ser",),
