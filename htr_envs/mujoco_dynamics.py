@@ -10,6 +10,7 @@ import os
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, ClassVar
+from weakref import WeakSet
 
 import numpy as np
 from gymnasium import spaces
@@ -35,8 +36,20 @@ FRAME_WIDTH, FRAME_HEIGHT = 640, 400
 AZIMUTH, ELEVATION = 90.0, -45.0
 # How far away, as multiples of the width and the depth of where they are
 DISTANCE = np.array([1.2, 1.45])
-# Threads of a process that this one was forked from
+# Those with threads, and threads of a process that this one was forked from: who puts them away waits for them for ever
+THREADED: WeakSet[MujocoDynamics] = WeakSet()
 LOST: list[Any] = []
+
+
+def _lose_threads() -> None:
+    for dynamics in THREADED:
+        LOST.append(dynamics._rollout)
+        dynamics._rollout = None
+    THREADED.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_lose_threads)
 
 
 class MujocoDynamics(Dynamics[PositionGoalFamily]):
@@ -94,7 +107,6 @@ class MujocoDynamics(Dynamics[PositionGoalFamily]):
         self._next_states = np.zeros((num_envs, self.frame_skip, n_state))
         self._sensors = np.zeros((num_envs, self.frame_skip, self.model.nsensordata))
         self._rollout: tuple[Rollout, list[mujoco.MjData]] | None = None
-        self._process = os.getpid()  # that started the threads
         self._renderer: tuple[Any, mujoco.MjData] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -105,12 +117,8 @@ class MujocoDynamics(Dynamics[PositionGoalFamily]):
         return self.observe(self.states[indices])
 
     def step(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        if self._rollout is not None and self._process != os.getpid():
-            # a fork has no threads of its parent, and would wait for them, here or where they are put away
-            LOST.append(self._rollout)
-            self._rollout = None
         if self._rollout is None:
-            self._process = os.getpid()
+            THREADED.add(self)
             # with one thread the calling one does the work
             threads = Rollout(nthread=self.n_threads if self.n_threads > 1 else 0)
             self._rollout = threads, [mujoco.MjData(self.model) for _ in range(self.n_threads)]

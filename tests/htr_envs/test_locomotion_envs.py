@@ -65,8 +65,13 @@ env.step(actions)
 child = os.fork()
 states = env.step(actions)[0].tobytes()
 if child == 0:
+    env.close()
     os._exit(0 if len(states) else 1)
 assert os.waitpid(child, 0)[1] == 0
+if os.fork() == 0:  # without a step
+    env.close()
+    os._exit(0)
+assert os.wait()[1] == 0
 """
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
