@@ -113,6 +113,10 @@ def cut_monitor_files(run: Path, folder: Path, sizes: dict[str, int]) -> None:
         path.unlink()
 
 
+class NotPlain(ValueError):
+    """A state that no checkpoint can hold."""
+
+
 class CheckpointCallback(BaseCallback):
     """
     Saves all that a training is, between rollouts and at its end, as ``<save_path>/checkpoints/<steps>_steps/``.
@@ -232,6 +236,8 @@ class CheckpointCallback(BaseCallback):
         self._stopped = self.stopping
         try:
             write_checkpoint(folder, self._state())
+        except NotPlain:
+            raise  # is no full disk, and would never be written
         except WRITE_ERRORS as error:
             then = "Training goes on, and tries again before the next rollout."
             if self._stopped:
@@ -293,7 +299,7 @@ class CheckpointCallback(BaseCallback):
                 file.seek(0)
                 th.load(file, weights_only=True)
             except Exception as error:
-                raise ValueError(
+                raise NotPlain(
                     f"The state_dict() of {type(callback).__name__} cannot be saved: it may hold tensors, numbers of Python, "
                     "texts and None, in lists, tuples and dicts."
                 ) from error

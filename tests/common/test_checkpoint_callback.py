@@ -61,6 +61,18 @@ def test_a_callback_that_cannot_be_saved_says_so_at_once(tiny_pearl: MakePEARL, 
     assert model.num_timesteps == 0
 
 
+class HasNumbersOfNumpyLater(HasNumbersOfNumpy):
+    def state_dict(self) -> dict[str, Any]:
+        return super().state_dict() if self.num_timesteps else {}
+
+
+def test_a_state_that_cannot_be_saved_is_no_full_disk(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    """Training would go on for days without a checkpoint."""
+    callback = HasNumbersOfNumpyLater()
+    with pytest.raises(ValueError, match=r"The state_dict\(\) of HasNumbersOfNumpyLater cannot be saved"):
+        tiny_pearl().learn(3 * ROLLOUT, [callback, CheckpointCallback(1, str(tmp_path), companions=[callback])])
+
+
 def test_texts_of_the_monitor_go_on(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
     def make() -> Any:
         return DummyVecEnv([lambda: Monitor(InAKitchen(gym.make(ENV_ID)), info_keywords=("scene",))] * 4)
