@@ -58,20 +58,28 @@ def acting_state(policy: Any) -> dict[str, Any]:
     """
     :param policy: a PEARLPolicy, or an :class:`ActorAlone`
     :return: tensors, numbers and text, for :func:`make_actor_alone`
-    :raises ValueError: if it has an actor of its own
+    :raises ValueError: if it has an actor of its own, or acts in another way than its actor says
     """
     activation = policy.activation_fn.__name__
     if type(policy.actor) is not Actor or ACTIVATIONS.get(activation) is not policy.activation_fn:
         raise ValueError(
             f"Only SB3's Actor with one of the activations {', '.join(ACTIVATIONS)} can be saved alone: save the model."
         )
-    return {
+    state = {
         "observation_space": _box_state(policy.observation_space),
         "action_space": _box_state(policy.action_space),
         "activation": activation,
         "actor": policy.actor.state_dict(),
         "normalizer": None if policy.normalizer is None else policy.normalizer.state_dict(),
     }
+    rng = np.random.default_rng(0)
+    obs = rng.uniform(-1, 1, (16, *policy.observation_space.shape)).astype(np.float32)
+    z = rng.standard_normal((16, policy.latent_dim)).astype(np.float32)
+    alone = make_actor_alone(state, policy.latent_dim)
+    actions, expected = (actor.predict(obs, (z,), deterministic=True)[0] for actor in (alone, policy))
+    if not np.allclose(actions, expected, atol=1e-3):
+        raise ValueError("The policy is a class of its own that acts in a way of its own: save the model.")
+    return state
 
 
 def make_actor_alone(state: dict[str, Any], latent_dim: int) -> ActorAlone:

@@ -5,6 +5,7 @@ import pathlib
 from collections.abc import Iterable
 from typing import Any, TypeVar
 
+import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_htr.common.atomic import atomic_path
@@ -42,7 +43,7 @@ class CheckedFiles(BaseAlgorithm):
         if str(path).endswith(".pt"):
             raise ValueError(f"{path} is no model: an agent that is adapted to a task is loaded by AdaptedAgent.load.")
         try:
-            return super().load(path, env, *args, **kwargs)
+            model = super().load(path, env, *args, **kwargs)
         except (KeyError, AttributeError) as error:
             if "ent_coef" not in kwargs:
                 raise
@@ -50,6 +51,10 @@ class CheckedFiles(BaseAlgorithm):
                 f"ent_coef is {kwargs['ent_coef']!r}, and that of the file is of the other kind, a number or learnt ('auto'), "
                 "which the rest of the file depends on: leave it out, or train anew."
             ) from error
+        state = vars(model)
+        if "ent_coef_tensor" in state:  # SB3 has put that of the file in the place of one that was given
+            state["ent_coef_tensor"] = th.tensor(float(state["ent_coef"]), device=model.device)
+        return model
 
     def _setup_model(self) -> None:
         self._check_policy_class()

@@ -273,10 +273,13 @@ class MultiTaskReplayBuffer(ReplayBuffer):
 
     def reset(self) -> None:
         """Remove all episodes."""
-        store = self.episodes
-        self.episodes = EpisodeStore(self.n_tasks, store.episodes_per_task, store.episode_length, self.transitions.width)
+        self.episodes = self._empty_store()
         self.relabeller.reset()
         self.discard_open_episodes()
+
+    def _empty_store(self) -> EpisodeStore:
+        store = self.episodes
+        return EpisodeStore(self.n_tasks, store.episodes_per_task, store.episode_length, self.transitions.width)
 
     def state_dict(self) -> dict[str, Any]:
         """
@@ -302,9 +305,11 @@ class MultiTaskReplayBuffer(ReplayBuffer):
                 f"{own} keeps what it has relabelled, and what was saved is of {by or 'a relabeller that does not'}: make the "
                 "model with the relabeller that it was saved with."
             )
+        episodes = self._empty_store()
+        episodes.load_state_dict(state["episodes"])
+        self._check_rewards(self.task_family, episodes)
         self.relabeller.load_state_dict(state["relabeller"])
-        self.episodes.load_state_dict(state["episodes"])
-        self.check_rewards_of(self.task_family)
+        self.episodes = episodes
         for generator, saved in zip((self._rng, self.relabel_rng), state["random"], strict=True):
             set_generator_state(generator, saved)
         self.discard_open_episodes()
@@ -316,15 +321,18 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         :param family: that is to tell rewards of what is stored
         :raises ValueError: if it tells others than were stored
         """
-        index, columns = self.episodes.index(), self.transitions
+        self._check_rewards(family, self.episodes)
+
+    def _check_rewards(self, family: TaskFamily, episodes: EpisodeStore) -> None:
+        index, columns = episodes.index(), self.transitions
         if len(index.rows) == 0 or missing_hook(family) is not None:
             return
-        rewarded = np.flatnonzero(np.repeat(self.rewarded(self.episodes), np.diff(index.episode_row)))
+        rewarded = np.flatnonzero(np.repeat(self.rewarded(episodes), np.diff(index.episode_row)))
         # Not drawn: as many random numbers are to follow as without
         some = [of[:: max(1, 2 * len(of) // N_COMPARED)] for of in (np.arange(len(index.rows)), rewarded)]
         virtual = np.concatenate(some)
         task = np.searchsorted(index.task_row, virtual, side="right") - 1
-        rows = self.episodes.take(virtual)
+        rows = episodes.take(virtual)
         computed = family.compute_reward(columns.trajectory(rows[:, None]), family.train_tasks[task])
         try:
             check_rewards_told(rows[:, columns.reward], np.asarray(computed)[:, 0], task)

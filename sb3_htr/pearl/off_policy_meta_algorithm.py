@@ -155,7 +155,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
             self.replay_buffer = ReplayBuffer(1, self.observation_space, self.action_space)  # type: ignore[assignment]
         else:
             self._check_rollouts()
-            self._setup_replay(self.env)
+            self._take_replay(*self._make_replay(self.env))
         with warnings.catch_warnings():
             # SB3 does not know that this buffer has them
             warnings.filterwarnings("ignore", "`n_steps=")
@@ -194,19 +194,11 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
                 f"train_explorer={{'name': {explorer.name!r}, 'n_exploration_episodes': {n_episodes // 2}}}."
             )
 
-    def _setup_replay(self, env: VecEnv) -> None:
+    def _make_replay(self, env: VecEnv) -> tuple[MultiTaskReplayBuffer, TaskBank]:
         checks.check_rewards(env)
         family = checks.get_task_family(env)
-        before, self.max_episode_steps = self.max_episode_steps, checks.get_max_episode_steps(env)
-        if before not in (None, self.max_episode_steps):
-            warnings.warn(
-                f"The env's time limit is {self.max_episode_steps} steps, and what follows from it is still of {before}: to "
-                f"train on this env, make a new model, or give load what it should have ({', '.join(BY_HORIZON)})."
-            )
-        # Training tasks in the order of the coming rollouts: every task once, then every task once in another order
-        self._task_queue = np.zeros(0, dtype=np.int64)
         buffer_class = cast(type[MultiTaskReplayBuffer], self.replay_buffer_class)
-        self.replay_buffer = buffer_class(
+        replay_buffer = buffer_class(
             self.buffer_size,
             self.observation_space,
             self.action_space,
@@ -214,21 +206,35 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
             n_envs=self.n_envs,
             seed=self.seed,
             task_family=family,
-            max_episode_steps=self.max_episode_steps,
+            max_episode_steps=checks.get_max_episode_steps(env),
             **self.replay_buffer_kwargs,
         )
-        self.task_bank = TaskBank(family, self.replay_buffer.transitions, self.context_size, self.seed)
-        self.replay_buffer.episode_listeners.append(self.task_bank.on_episode)
+        task_bank = TaskBank(family, replay_buffer.transitions, self.context_size, self.seed)
+        replay_buffer.episode_listeners.append(task_bank.on_episode)
+        return replay_buffer, task_bank
+
+    def _take_replay(self, replay_buffer: MultiTaskReplayBuffer, task_bank: TaskBank) -> None:
+        if self.max_episode_steps not in (None, replay_buffer.max_episode_steps):
+            warnings.warn(
+                f"The env's time limit is {replay_buffer.max_episode_steps} steps, and what follows from it is still of "
+                f"{self.max_episode_steps}: to train on this env, make a new model, or give load what it should have "
+                f"({', '.join(BY_HORIZON)})."
+            )
+        self.replay_buffer, self.task_bank = replay_buffer, task_bank
+        self.max_episode_steps = replay_buffer.max_episode_steps
+        # Training tasks in the order of the coming rollouts: every task once, then every task once in another order
+        self._task_queue = np.zeros(0, dtype=np.int64)
 
     def _introduce_policy(self) -> None:
         if self.replay_buffer is not None:
             self.replay_buffer.relabeller.policy = self.policy
             self.knowledge.set_tells_success(self.replay_buffer.tells_rewards)
             for explorer in (self.explorer, self.train_explorer):
-                self._check_explorer(explorer)
+                self._check_explorer(explorer, self.knowledge.tells_success)
 
-    def _check_explorer(self, explorer: Explorer) -> None:
-        if explorer.needs_success and not self.knowledge.tells_success:
+    @staticmethod
+    def _check_explorer(explorer: Explorer, tells_success: bool) -> None:
+        if explorer.needs_success and not tells_success:
             raise ValueError(
                 f"The explorer {explorer.name!r} goes by successes, of which the env's task_family tells nothing: pass "
                 "explorer='prior' and train_explorer='prior'."
@@ -258,10 +264,15 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
                     f"The env's time limit is {n_steps} steps, and what was collected has room for episodes of "
                     f"{self.replay_buffer.max_episode_steps}: load the model on this env, without its experience."
                 )
+            super().set_env(vec_env, force_reset)
+            return
+        # All that can be refused, before anything is taken
+        replay_buffer, task_bank = self._make_replay(vec_env)
+        for explorer in (self.explorer, self.train_explorer):
+            self._check_explorer(explorer, replay_buffer.tells_rewards)
         super().set_env(vec_env, force_reset)
-        if self.replay_buffer is None or self.replay_buffer.size() == 0:
-            self._setup_replay(vec_env)
-            self._introduce_policy()
+        self._take_replay(replay_buffer, task_bank)
+        self._introduce_policy()
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """
@@ -468,7 +479,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         """
         own = to_explorer(self.explorer)
         chosen = own if explorer in (None, own.name) else to_explorer(explorer)
-        self._check_explorer(chosen)
+        self._check_explorer(chosen, self.knowledge.tells_success)
         check_numbers(n_envs=(n_envs, 1))
         self.policy.set_training_mode(False)
         return Adaptation(

@@ -65,7 +65,8 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
     path = path if os.path.exists(path) else with_suffix(path, ".zip")
     try:
         data, weights = read_model(path, ("policy", "knowledge"))
-        settings: dict[str, Any] = {name: _plain(data[name]) for name in EXPLORERS}
+        _check_is_ours("policy", data["policy_class"].get("__module__", ""))
+        settings: dict[str, Any] = {name: _plain(name, data[name]) for name in EXPLORERS if name not in kwargs}
         settings |= {name: data[name] for name in NUMBERS if type(data.get(name)) in (int, float)}
         # A schedule may be one that is read below; no other number is an object
         for name in [name for name in NUMBERS if isinstance(data.get(name), dict) and name != "learning_rate"]:
@@ -101,7 +102,13 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
     return model
 
 
-def _plain(explorer: dict[str, Any]) -> dict[str, Any]:
+def _check_is_ours(what: str, module: str) -> None:
+    if not module.startswith("sb3_htr."):
+        raise Refused(f"its {what} is a class of its own, which only PEARL.load restores, and that may run code of the file.")
+
+
+def _plain(what: str, explorer: dict[str, Any]) -> dict[str, Any]:
+    _check_is_ours(what, explorer.get(TYPE, "").removeprefix("<class '"))
     settings = {key: value for key, value in explorer.items() if key not in (TYPE, PICKLED)}
     name = settings.get("name")
     if not isinstance(name, str) or name not in explorers.EXPLORERS:

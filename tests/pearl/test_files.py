@@ -30,6 +30,7 @@ from sb3_htr.adaptation import Aggregate, Belief, Prior
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr import EpisodeClustering
 from sb3_htr.pearl.pearl import LEARNING_RATE
+from sb3_htr.pearl.policies import PEARLPolicy
 from sb3_htr.pearl.untrusted import NUMBERS, WORDS
 from sb3_htr.rivals.rl2 import RL2
 from sb3_htr.rivals.sac_her import SACHER
@@ -74,7 +75,7 @@ def test_loading_an_untrusted_model_runs_no_code(tiny_pearl: MakePEARL, tmp_path
     with pytest.raises(ValueError, match=r"bomb\.zip is damaged, or no model saved by PEARL"):
         load_untrusted(tmp_path / "bomb.zip", ENV_ID)
     # What it needs is read, all else is ignored; its weights are fine
-    hostile |= {name: data[name] for name in ("explorer", "train_explorer")}
+    hostile |= {name: data[name] for name in ("policy_class", "explorer", "train_explorer")}
     with pytest.raises(ValueError, match="its policy has the setting 'optimizer_class', which only"):
         repack(tmp_path / "model.zip", tmp_path / "bomb.zip", {"data": json.dumps(hostile).encode()})
         load_untrusted(tmp_path / "bomb.zip", ENV_ID)
@@ -83,7 +84,7 @@ def test_loading_an_untrusted_model_runs_no_code(tiny_pearl: MakePEARL, tmp_path
     load_untrusted(tmp_path / "bomb.zip", ENV_ID)
     hostile["explorer"] = serialized
     repack(tmp_path / "model.zip", tmp_path / "bomb.zip", {"data": json.dumps(hostile).encode()})
-    with pytest.raises(ValueError, match=r"explorer is {}, expected one of"):
+    with pytest.raises(ValueError, match="its explorer is a class of its own"):
         load_untrusted(tmp_path / "bomb.zip", ENV_ID)
     load_untrusted(tmp_path / "bomb.zip", ENV_ID, explorer="belief")
     assert not fuse.exists()
@@ -345,3 +346,51 @@ def test_layers_of_actor_and_critics_may_differ(tiny_pearl: MakePEARL, tmp_path:
     loaded = load_untrusted(tmp_path / "model", ENV_ID)
     for a, b in zip(evaluate_adaptation(model, ENV_ID), evaluate_adaptation(loaded, ENV_ID), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_an_entropy_coefficient_that_load_is_given_is_the_one_that_is_used(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    tiny_pearl(ent_coef=0.01).save(tmp_path / "model")
+    SACHER("MultiInputPolicy", ENV_ID, ent_coef=0.01).save(tmp_path / "told")
+    for model in (PEARL.load(tmp_path / "model", ent_coef=0.2), SACHER.load(tmp_path / "told", ent_coef=0.2)):
+        assert model.ent_coef == 0.2 and model.ent_coef_tensor.item() == pytest.approx(0.2)
+    assert PEARL.load(tmp_path / "model").ent_coef_tensor.item() == pytest.approx(0.01)
+
+
+class ActsByHalf(PEARLPolicy):
+    def _act(self, obs_z: th.Tensor, deterministic: bool) -> th.Tensor:
+        return super()._act(obs_z, deterministic) / 2
+
+
+class OwnPrior(Prior):
+    """Has the name of another one."""
+
+
+def test_what_acts_in_a_way_of_its_own_is_not_loaded_as_something_else(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    own = PEARL(ActsByHalf, ENV_ID, policy_kwargs=with_policy())
+    own.save(tmp_path / "policy")
+    tiny_pearl(explorer=OwnPrior()).save(tmp_path / "explorer")
+    for name, what in (("policy", "its policy is a class of its own"), ("explorer", "its explorer is a class of its own")):
+        with pytest.raises(ValueError, match=f"{what}, which only PEARL.load restores"):
+            load_untrusted(tmp_path / name, ENV_ID)
+        assert PEARL.load(tmp_path / name).policy is not None
+    load_untrusted(tmp_path / "explorer", ENV_ID, explorer="prior")
+    agent = AdaptedAgent(own.policy, np.zeros(5, dtype=np.float32), np.zeros(0), np.zeros(0, dtype=bool))
+    with pytest.raises(ValueError, match="acts in a way of its own: save the model"):
+        agent.save(tmp_path / "agent")
+
+
+def test_what_was_refused_is_not_there(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    """Else the next learn() trains with it."""
+    model = tiny_pearl(buffer_size=80 * 20)
+    env, replay = model.env, model.replay_buffer
+    with pytest.raises(ValueError, match="too small for one episode"):
+        model.set_env(make_task_vec_env(ENV_ID, 4, env_kwargs={"n_train_tasks": 200}))
+    assert model.env is env and model.replay_buffer is replay and model.max_episode_steps == 20
+    other = tiny_pearl().learn(ROLLOUT)
+    assert other.replay_buffer is not None
+    other.replay_buffer.episodes._data[..., other.replay_buffer.transitions.reward] += 1
+    other.save_replay_buffer(tmp_path / "replay")
+    model = tiny_pearl()
+    with pytest.raises(ValueError, match="of another task family"):
+        model.load_replay_buffer(tmp_path / "replay")
+    assert model.replay_buffer is not None and model.replay_buffer.size() == 0
