@@ -288,8 +288,8 @@ def check_is_not_normalized(env: VecEnv) -> None:
         name = "VecNormalize"
     if name is not None:
         raise ValueError(
-            f"{name} stands between the env and relabelled rewards, and is not saved with the model: leave it out, the "
-            "policy normalizes observations itself. Rewards cannot be normalized: all tasks share one scale."
+            f"{name} stands between the env and relabelled rewards, and is not saved with the model: leave it out. "
+            "PEARL's policy normalizes observations itself. Rewards cannot be normalized: all tasks share one scale."
         )
 
 

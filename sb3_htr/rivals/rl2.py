@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.adaptation import Step
 from sb3_htr.adaptation.loop import Adapting
-from sb3_htr.common.checks import check_is_env
+from sb3_htr.common.checks import check_is_env, check_is_not_normalized, get_max_episode_steps
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.vec_env import N_ENVS, in_float32, make_task_vec_env
 from sb3_htr.rivals.base import Rival, RivalAdaptation
@@ -120,7 +120,9 @@ class RL2(Rival, RecurrentPPO):
         if isinstance(env, TrialVecEnv):
             return env
         check_is_env(env)
-        return TrialVecEnv(in_float32(RecurrentPPO._wrap_env(env, verbose, monitor_wrapper)), N_EPISODES_PER_TRIAL)
+        vec_env = in_float32(RecurrentPPO._wrap_env(env, verbose, monitor_wrapper))
+        check_is_not_normalized(vec_env)
+        return TrialVecEnv(vec_env, N_EPISODES_PER_TRIAL)
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -132,14 +134,18 @@ class RL2(Rival, RecurrentPPO):
         :param force_reset: reset before training goes on
         :raises ValueError: for another time limit
         """
-        super().set_env(env, force_reset)
+        vec_env = self._wrap_env(env)
+        self._check_time_limit(vec_env)
+        super().set_env(vec_env, force_reset)
         self._set_trials()
 
     def _set_trials(self) -> None:
-        if self.env is None:
-            return
-        self.env.n_episodes = self.n_episodes_per_trial
-        n_steps = self.n_trials_per_rollout * self.env.max_trial_steps
+        if self.env is not None:
+            self._check_time_limit(self.env)
+            self.env.n_episodes = self.n_episodes_per_trial
+
+    def _check_time_limit(self, env: VecEnv) -> None:
+        n_steps = self.n_trials_per_rollout * self.n_episodes_per_trial * get_max_episode_steps(env)
         if n_steps != self.n_steps:
             raise ValueError(
                 f"Whole trials in this env are rollouts of {n_steps} steps, but those of the model have {self.n_steps}: give "

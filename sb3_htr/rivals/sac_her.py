@@ -1,5 +1,7 @@
 """SAC with hindsight experience replay, told its task: the ceiling for agents that have to find it out."""
 
+import io
+import pathlib
 import warnings
 from typing import Any, ClassVar
 
@@ -17,6 +19,7 @@ from stable_baselines3.sac.policies import MultiInputPolicy, SACPolicy
 
 from sb3_htr.adaptation.loop import Adapting
 from sb3_htr.common.checks import (
+    check_has_env,
     check_is_env,
     check_rewards,
     check_same_family,
@@ -36,6 +39,9 @@ class TaskHerReplayBuffer(HerReplayBuffer):
     """
     SB3's HER, with the reward hook of the task family, which rewards a whole step and not its achieved goal alone.
     """
+
+    #: Of where a pickled one was filled
+    family_facts: dict[str, Any]
 
     def add(  # type: ignore[override]
         self,
@@ -76,6 +82,10 @@ class TaskHerReplayBuffer(HerReplayBuffer):
             next_observations={**real.next_observations, "desired_goal": shown},
             rewards=self.to_torch(rewards[:, None]),
         )
+
+    def __getstate__(self) -> dict[str, Any]:
+        assert isinstance(self.env, ShownTaskVecEnv)
+        return {**super().__getstate__(), "family_facts": family_facts(self.env.shown.family)}
 
     def state_dict(self) -> dict[str, Any]:
         """
@@ -204,8 +214,26 @@ class SACHER(Rival, SAC):
         vec_env = self._wrap_env(env)
         if self._has_experience():
             check_same_family(family_facts(self.shown.family), family_facts(get_task_family(vec_env)), "The env")
+        check_rewards(vec_env)  # before anything is taken
+        get_max_episode_steps(vec_env)
         super().set_env(vec_env, force_reset)
         self._setup_replay(vec_env)
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """
+        :param path: file of ``save_replay_buffer``. It is a pickle, which can run code: take none from strangers
+        :param truncate_last_traj: end the episodes that are not complete
+        :raises ValueError: if it is of another number of envs, or another task family
+        """
+        check_has_env(self.env)
+        own = self.replay_buffer
+        super().load_replay_buffer(path, truncate_last_traj)
+        loaded, self.replay_buffer = self.replay_buffer, own
+        assert isinstance(loaded, TaskHerReplayBuffer)
+        if loaded.n_envs != self.n_envs:
+            raise ValueError(f"{path} is of {loaded.n_envs} envs, and this model has {self.n_envs}: load it on as many.")
+        check_same_family(loaded.family_facts, family_facts(self.shown.family), "This model's env")
+        self.replay_buffer = loaded
 
     def begin_rollout(self) -> None:
         super().begin_rollout()

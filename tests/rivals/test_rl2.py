@@ -2,11 +2,12 @@
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from helpers import ENV_ID
 from helpers.carts import make_cart
@@ -165,3 +166,21 @@ def test_a_trial_is_one_call_of_the_lstm_and_the_library_would_learn_the_same() 
         assert len(calls) == 2 if of is TrialLstmPolicy else len(calls) > 2
     for ours, theirs in zip(*gradients, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-5)
+
+
+def test_an_env_that_normalizes_is_refused_before_the_training() -> None:
+    """It is at meta-test, where the training would be lost."""
+    for env in (
+        VecNormalize(make_task_vec_env(ENV_ID, 2)),
+        DummyVecEnv([lambda: gym.wrappers.NormalizeObservation(gym.make(ENV_ID))]),
+    ):
+        with pytest.raises(ValueError, match=r"Normalize.* stands between the env and"):
+            tiny_rl2(env)
+
+
+def test_an_env_with_another_time_limit_is_refused_and_not_trained_on() -> None:
+    model = tiny_rl2()
+    env = model.env
+    with pytest.raises(ValueError, match="give an env of the same time limit"):
+        model.set_env(make_task_vec_env(ENV_ID, 2, env_kwargs={"max_episode_steps": 10}))
+    assert model.env is env

@@ -193,3 +193,17 @@ class Silent(gym.Wrapper[Any, Any, Any, Any]):
 def test_an_env_need_not_name_what_a_step_achieved() -> None:
     model = tiny_sac_her(make_task_vec_env(ENV_ID, 4, wrapper=Silent)).learn(160)
     assert model.num_timesteps == 160
+
+
+def test_replay_of_another_family_or_number_of_envs_is_refused_and_not_learnt_from(tmp_path: Any) -> None:
+    tiny_sac_her(make_task_vec_env(ENV_ID, 4, env_kwargs={"goal_radius": 0.9})).learn(400).save_replay_buffer(tmp_path / "far")
+    tiny_sac_her(make_task_vec_env(ENV_ID, 2)).learn(80).save_replay_buffer(tmp_path / "two")
+    tiny_sac_her().learn(80).save_replay_buffer(tmp_path / "same")
+    model = tiny_sac_her()
+    before = model.replay_buffer
+    for name, message in (("far", "another task family: its goal_radius"), ("two", "of 2 envs, and this model has 4")):
+        with pytest.raises(ValueError, match=message):
+            model.load_replay_buffer(tmp_path / name)
+        assert model.replay_buffer is before
+    model.load_replay_buffer(tmp_path / "same")
+    assert model.replay_buffer is not before and model.learn(80).num_timesteps == 80
