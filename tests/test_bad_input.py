@@ -75,7 +75,7 @@ class WithoutHook(gym.Wrapper[Any, Any, Any, Any]):
         ),
         (
             lambda: VecNormalize(make_task_vec_env(ENV_ID, 2)),
-            "VecNormalize stands between .*the policy normalizes observations itself",
+            "VecNormalize stands between .*policy normalizes observations itself",
         ),
         (lambda: DummyVecEnv([lambda: gym.make("Pendulum-v1")]), "no task_family"),
     ],
@@ -539,10 +539,13 @@ numbers = st.one_of(st.integers(-3, 300), st.floats(-2, 2), st.just(float("nan")
 )
 def test_fuzzed_settings_are_taken_or_refused_in_one_sentence(kwargs: dict[str, Any], replay: dict[str, Any]) -> None:
     try:
-        PEARL("MlpPolicy", ENV_ID, replay_buffer_kwargs=replay, _init_setup_model=bool(replay), **kwargs)
+        model = PEARL("MlpPolicy", ENV_ID, replay_buffer_kwargs=replay, **kwargs)
     except ValueError as error:
         assert str(error).count("\n") == 0
         assert any(name in str(error) for name in (*kwargs, *replay))
+    else:
+        assert all(np.isfinite(value) and value >= 0 for value in (*kwargs.values(), *replay.values()))
+        assert model.gamma <= 1 and 0 < model.tau <= 1 and model.meta_batch_size >= 1
 
 
 class DropsOptions(gym.Wrapper[Any, Any, Any, Any]):

@@ -2,6 +2,7 @@
 
 import difflib
 import inspect
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar, cast
 
@@ -36,18 +37,18 @@ def make(setting: str, value: Any, kinds: Mapping[str, Callable[..., Kind]], bas
 
 def check_numbers(**numbers: tuple[Any, float] | tuple[Any, float, float]) -> None:
     """
-    :param numbers: name of a setting, its value, and the smallest and, if there is one, the largest value that it may have;
-        with an int as the smallest one, it must be a whole number
+    :param numbers: name of a setting, its value, and the smallest and, if there is one, the largest value that it may have,
+        which may be infinite; with an int as the smallest one, it must be a whole number
     :raises ValueError: for the first one that is none, or out of its range
     """
     for name, (value, low, *largest) in numbers.items():
-        high = largest[0] if largest else float("inf")
+        high = largest[0] if largest else sys.float_info.max
         whole = isinstance(low, int)
         kind = int | np.integer if whole else int | float | np.number
         # written so that nan, which compares with nothing, is refused too
         if isinstance(value, bool) or not (isinstance(value, kind) and low <= value <= high):
             article = "a whole number" if whole else "a number"
-            limits = f"of at least {low:g}" if high == float("inf") else f"from {low:g} to {high:g}"
+            limits = f"of at least {low:g}" if high >= sys.float_info.max else f"from {low:g} to {high:g}"
             raise ValueError(f"{name} is {value!r}, expected {article} {limits}.")
 
 

@@ -33,7 +33,7 @@ class TrainingTaskRelabelling(HindsightBuffers):
     """
 
     def __init__(self, temperature: float = 0.01) -> None:
-        check_numbers(temperature=(temperature, 0.0))
+        check_numbers(temperature=(temperature, 0.0, float("inf")))
         if temperature == 0:
             raise ValueError("temperature is 0, by which utilities cannot be divided: expected a number above 0.")
         self.temperature = temperature
