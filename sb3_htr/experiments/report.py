@@ -15,7 +15,7 @@ from sb3_htr.experiments.calibration import expected_calibration_error
 from sb3_htr.experiments.cell import REMOVE, Cell, Evaluation
 from sb3_htr.experiments.grid import Experiment
 from sb3_htr.experiments.protocol import EVAL_SEEDS, METRICS, TIMES, env_steps_to_solved, is_solved, scores
-from sb3_htr.experiments.runner import LOGGED, machine
+from sb3_htr.experiments.runner import LOGGED
 from sb3_htr.zoo.plots.intervals import iqm_difference, iqm_interval
 
 RETURN = "last_episode_return"
@@ -85,8 +85,9 @@ def summarize(command: str, results: dict[Cell, Path]) -> dict[str, Any]:
         "command": command,
         **{key: ", ".join(sorted({str(raw[key]) for runs in all_runs for raw in runs.raws})) for key in COMMITS},
         "date": date.today().isoformat(),
-        # Older results do not say: they are taken for this one's
-        "machine": ", ".join(sorted({str(raw.get("machine", machine())) for runs in all_runs for raw in runs.raws})),
+        "machine": ", ".join(
+            sorted({str(raw.get("machine", "a machine that was not recorded")) for runs in all_runs for raw in runs.raws})
+        ),
         "n_eval_seeds": len(EVAL_SEEDS),
         "rows": [row for runs in all_runs for row in _rows(runs)],
         "differences": [row for first, *others in compared for other in others for row in _differences(first, other)],
