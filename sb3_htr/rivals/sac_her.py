@@ -84,8 +84,9 @@ class TaskHerReplayBuffer(HerReplayBuffer):
         )
 
     def __getstate__(self) -> dict[str, Any]:
-        assert isinstance(self.env, ShownTaskVecEnv)
-        return {**super().__getstate__(), "family_facts": family_facts(self.env.shown.family)}
+        if isinstance(self.env, ShownTaskVecEnv):  # a copy has none before its first rollout
+            self.family_facts = family_facts(self.env.shown.family)
+        return super().__getstate__()
 
     def state_dict(self) -> dict[str, Any]:
         """
@@ -238,6 +239,7 @@ class SACHER(Rival, SAC):
     def begin_rollout(self) -> None:
         super().begin_rollout()
         assert isinstance(self.replay_buffer, TaskHerReplayBuffer)
+        self.replay_buffer.env = self.env  # which SB3 leaves out of copies
         self.replay_buffer.truncate_last_trajectory()
 
     def collect_rollouts(self, env: VecEnv, callback: BaseCallback, *args: Any, **kwargs: Any) -> RolloutReturn:

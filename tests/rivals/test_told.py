@@ -1,5 +1,6 @@
 """Ceilings that are told the task, SAC with HER and scripts; and the floor."""
 
+import copy
 from typing import Any
 
 import gymnasium as gym
@@ -94,6 +95,12 @@ def test_another_env_brings_its_task_family_unless_there_is_experience() -> None
     same = make_task_vec_env(ENV_ID, 4, seed=1, env_kwargs={"goal_radius": 0.9})
     model.set_env(same)
     assert model.learn(80).num_timesteps == 80
+
+
+def test_a_deep_copy_of_a_deep_copy_learns_and_saves_its_replay(tmp_path: Any) -> None:
+    twin = copy.deepcopy(copy.deepcopy(tiny_sac_her().learn(80)))
+    twin.save_replay_buffer(tmp_path / "replay")
+    assert twin.learn(80, reset_num_timesteps=False).num_timesteps == 160
 
 
 def test_training_is_on_training_tasks_after_an_evaluation_in_the_same_env() -> None:
