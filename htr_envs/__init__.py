@@ -8,12 +8,13 @@ from htr_envs.goal_env import HiddenGoalEnv, HiddenGoalFamily, hide_goal
 from htr_envs.meta_env import MetaEnv, TaskDistribution
 from htr_envs.point_robot import PointRobotEnv, PointRobotFamily, PointRobotVectorEnv
 from htr_envs.position_goals import PositionGoalFamily
-from htr_envs.semicircle_goals import LocomotionFamily, SemicircleGoalFamily
+from htr_envs.semicircle_goals import AntGoalFamily, LocomotionFamily, SemicircleGoalFamily
 from htr_envs.target_speed import TargetSpeedEnv, TargetSpeedFamily, TargetSpeedVectorEnv
 from htr_envs.task_env import TaskEnv, TaskFamily, Trajectory, at_step, check_reward_type
 from htr_envs.task_vector_env import TaskVectorEnv
 
 __all__ = [
+    "AntGoalFamily",
     "Dynamics",
     "DynamicsEnv",
     "DynamicsVectorEnv",

@@ -10,7 +10,7 @@ import numpy as np
 
 from htr_envs.dynamics import DynamicsEnv
 from htr_envs.mujoco_dynamics import DoubleArray, MujocoDynamics, MujocoVectorEnv, mujoco  # says so where MuJoCo is missing
-from htr_envs.semicircle_goals import LOCOMOTION_ARENA, LocomotionFamily
+from htr_envs.semicircle_goals import LOCOMOTION_ARENA, AntGoalFamily
 from htr_envs.task_env import BoolArray, FloatArray
 
 MODEL = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "ant.xml"
@@ -108,11 +108,10 @@ def _ants(
     contact_cost_weight: float = 5e-4,
     healthy_reward: float = 0.05,
     reset_noise_scale: float = 0.01,
-    goal_radius: float = 0.4,
     **family_kwargs: Any,
-) -> tuple[LocomotionFamily, AntDynamics]:
-    family = LocomotionFamily(goal_radius=goal_radius, **family_kwargs)
-    return family, AntDynamics(num_envs, n_threads, ctrl_cost_weight, contact_cost_weight, healthy_reward, reset_noise_scale)
+) -> tuple[AntGoalFamily, AntDynamics]:
+    dynamics = AntDynamics(num_envs, n_threads, ctrl_cost_weight, contact_cost_weight, healthy_reward, reset_noise_scale)
+    return AntGoalFamily(**family_kwargs), dynamics
 
 
 class AntEnv(DynamicsEnv):
@@ -164,7 +163,8 @@ class AntEnv(DynamicsEnv):
     With `d` the distance between the torso's next position on the floor and the goal:
 
     - `reward_type="sparse"`: `1 - d` if `d < goal_radius`, else `0`.
-    - `reward_type="dense"`: `-d`, the proxy reward of the oracle baseline.
+    - `reward_type="dense"`: `goal_distance - d`, the proxy reward of the oracle baseline. It is 0 where an episode starts, so
+      that falling, which ends it, pays nothing. With `-d`, three of five agents learned to fall early.
 
     Both plus the task-free reward `healthy_reward - ctrl_cost - contact_cost`:
 
@@ -180,6 +180,7 @@ class AntEnv(DynamicsEnv):
     formula within the radius is our choice: the one that the paper gives for the point robot. A success is thus worth at least
     `1 - goal_radius`, well above any cost of a step. Outside of the radius MAESN pays a number that depends on the goal's
     direction, and so tells it to an ant that never gets there: here it is 0.
+    MAESN's dense reward has a constant as well: 4, and the distance is the sum of those along x and y.
 
     ## Task distribution
 

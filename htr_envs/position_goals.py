@@ -49,15 +49,20 @@ class PositionGoalFamily(TaskFamily):
     def compute_reward(self, traj: Trajectory, task: ArrayLike, reward_type: str = "sparse") -> FloatArray:
         """Goal reward plus task-free reward of every step.
 
-        :param reward_type: ``"sparse"``: 0 for the goal where it is not reached. ``"dense"``: minus the distance to the goal.
+        :param reward_type: ``"sparse"``: 0 for the goal where it is not reached. ``"dense"``: minus the distance to the goal,
+            or what the family has in its place.
         """
         check_reward_type(reward_type)
         distance = self._distance(traj, task)
         if reward_type == "dense":
-            goal_reward = -distance
+            goal_reward = self._dense_reward(distance)
         else:
             goal_reward = np.where(distance < self.goal_radius, np.float32(1.0) - distance, np.float32(0.0))
         return np.asarray(goal_reward + traj.task_free_reward, dtype=np.float32)
+
+    def _dense_reward(self, distance: FloatArray) -> FloatArray:
+        """Of steps that end so far from the goal."""
+        return -distance
 
     def is_success(self, traj: Trajectory, task: ArrayLike) -> BoolArray:
         """Whether the next state of every step is within the goal radius."""

@@ -73,3 +73,22 @@ class LocomotionFamily(SemicircleGoalFamily):
 
     def __init__(self, goal_distance: float = 2.0, goal_radius: float = 0.5, **task_sets: Any) -> None:
         super().__init__(LOCOMOTION_ARENA, goal_distance, goal_radius, **task_sets)
+
+
+class AntGoalFamily(LocomotionFamily):
+    """The same for a robot whose episodes end when it falls.
+
+    The dense proxy is how much nearer the goal is than from the start. Minus the distance, as elsewhere, would pay for falling
+    early; MAESN (Gupta et al., 2018) adds a constant too, 4 at goals 2 away.
+
+    :param goal_distance: distance of the goals from the start, at most 20.
+    :param goal_radius: a goal is reached where the distance to it is smaller than this, at most 1.
+    :param task_sets: sizes and seed of the task sets, see :class:`SemicircleGoalFamily`.
+    :raises ValueError: if a number is out of range.
+    """
+
+    def __init__(self, goal_distance: float = 2.0, goal_radius: float = 0.4, **task_sets: Any) -> None:
+        super().__init__(goal_distance, goal_radius, **task_sets)
+
+    def _dense_reward(self, distance: FloatArray) -> FloatArray:
+        return np.float32(self.goal_distance) - distance
