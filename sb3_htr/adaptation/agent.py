@@ -10,6 +10,7 @@ from stable_baselines3.common.utils import get_device
 
 from sb3_htr.adaptation.actor_alone import acting_state, make_actor_alone
 from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.errors import OPEN_ERRORS
 from sb3_htr.common.latent_policy import Obs, State
 from sb3_htr.common.plain import load_plain
 from sb3_htr.common.saving import with_suffix
@@ -64,7 +65,7 @@ class AdaptedAgent:
         :param path: file of :meth:`save`; reading it runs no code, whoever it is from
         :param device: torch device
         :return: an agent that acts as the one that was saved
-        :raises FileNotFoundError: if there is no such file
+        :raises OSError: if there is no such file, or it cannot be opened
         :raises ValueError: if it is another kind of file
         """
         path = with_suffix(path, ".pt")
@@ -75,7 +76,7 @@ class AdaptedAgent:
             z, returns, successes = (state[name].numpy() for name in ("z", "returns", "successes"))
             (latent_dim,) = z.shape
             policy = make_actor_alone(state["policy"], latent_dim)
-        except FileNotFoundError:
+        except OPEN_ERRORS:
             raise
         except Exception:  # whatever a stranger can put into a file
             raise ValueError(f"{path} is damaged, or no agent saved by AdaptedAgent.save: nothing of it was loaded.") from None

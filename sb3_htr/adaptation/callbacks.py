@@ -48,6 +48,8 @@ class MetaEvalCallback(EvalCallback):
         **kwargs: Any,
     ) -> None:
         check_numbers(n_eval_episodes=(n_eval_episodes, 1))
+        if kwargs.get("render"):
+            raise ValueError("An evaluation shows no window: leave render out, and watch a saved model with `sb3-htr enjoy`.")
         if isinstance(eval_env, str):
             eval_env = make_task_vec_env(eval_env, N_ENVS)
         super().__init__(eval_env, n_eval_episodes=n_eval_episodes, **kwargs)

@@ -170,14 +170,18 @@ def record_adaptation(
             "stable_baselines3's evaluate_policy."
         )
     check_numbers(seed=(seed, 0, MAX_SEED))
-    n_tasks = N_ENVS if tasks is None or isinstance(tasks, str) else np.shape(tasks)[0] if np.ndim(tasks) else 1
+    tasks = "test" if tasks is None else tasks
     if isinstance(env, str):
-        env = make_task_vec_env(env, max(n_tasks, 1), seed)
+        # Of how many tasks, one env tells. Draws depend on the number of envs: the same tasks have it by name and as an array
+        one = make_task_vec_env(env)
+        n_tasks = len(task_set(get_task_family(one), tasks))
+        one.close()
+        env = make_task_vec_env(env, min(n_tasks, N_ENVS), seed)
     check_is_env(env)
     if isinstance(env, gym.Env):
         env = BaseAlgorithm._wrap_env(env, monitor_wrapper=False)
     model.check_env(env)
-    tasks = task_set(get_task_family(env), "test" if tasks is None else tasks)
+    tasks = task_set(get_task_family(env), tasks)
     seed = int(seed)  # torch takes no numbers of numpy
     generator = th.Generator().manual_seed(seed)
     env.seed(seed)
@@ -211,7 +215,8 @@ def evaluate_adaptation(
     The context of a task's posterior comes from the episodes of this very adaptation and from nowhere else.
 
     :param model: a PEARL, or a rival
-    :param env: env, VecEnv (its envs adapt side by side, each to a task of its own) or registered id
+    :param env: env, VecEnv (its envs adapt side by side, each to a task of its own) or registered id, of
+        which as many are made as there are tasks, up to 20
     :param tasks: (n_tasks, task_dim), or ``"train"``, ``"validation"`` or ``"test"`` (default), tasks of the env
     :param n_episodes: adaptation episodes per task; 20 in PEARL's reference
     :param explorer: an :class:`sb3_htr.adaptation.Explorer`, its name, or its name and settings; the model's own by default;

@@ -1,5 +1,7 @@
 """Callbacks of an algorithm beside those of its user."""
 
+from collections.abc import Iterator
+
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 
@@ -13,3 +15,14 @@ def followed_by(callback: MaybeCallback, last: BaseCallback) -> CallbackList:
     if isinstance(callback, list):
         callback = CallbackList(callback)
     return CallbackList([callback if isinstance(callback, BaseCallback) else ConvertCallback(callback), last])
+
+
+def parts_of(callback: BaseCallback) -> Iterator[BaseCallback]:
+    """
+    :param callback: may have others in it
+    :return: itself and all of these
+    """
+    yield callback
+    for part in (*getattr(callback, "callbacks", ()), getattr(callback, "callback", None)):
+        if isinstance(part, BaseCallback):
+            yield from parts_of(part)

@@ -1,4 +1,7 @@
-"""What an error says, in one line."""
+"""What an error says, in one line, and of what it is."""
+
+# Of a path that cannot be opened, whatever is in the file
+OPEN_ERRORS = (FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError)
 
 
 def last_line(error: Exception) -> str:

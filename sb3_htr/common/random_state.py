@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import torch as th
 
+from sb3_htr.common.settings import check_numbers
+
 # The largest that all generators take
 MAX_SEED = 2**32 - 1
 # Parts of a model that draw, each apart from the others
@@ -22,6 +24,18 @@ def stream(seed: int | None, name: str) -> np.random.Generator:
     :return: generator of this part, whose draws say nothing about those of other parts and of the envs
     """
     return np.random.default_rng(np.random.SeedSequence(seed).spawn(len(STREAMS))[STREAMS.index(name)])
+
+
+def checked_seed(seed: int | None) -> int | None:
+    """
+    :param seed: of a model
+    :return: the same, as Python's own generator takes it
+    :raises ValueError: if some generator does not take it
+    """
+    if seed is None:
+        return None
+    check_numbers(seed=(seed, 0, MAX_SEED))
+    return int(seed)
 
 
 def get_generator_state(generator: np.random.Generator) -> str:
@@ -50,7 +64,7 @@ def get_global_state() -> dict[str, Any]:
         "python": [version, list(internal), gauss],
         "numpy": [name, [int(key) for key in keys], position, has_gauss, cached],
         "torch": th.get_rng_state(),
-        "cuda": th.cuda.get_rng_state_all() if th.cuda.is_available() else [],
+        "cuda": th.cuda.get_rng_state_all() if th.cuda.is_initialized() else [],
     }
 
 

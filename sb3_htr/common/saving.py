@@ -3,10 +3,11 @@
 import io
 import pathlib
 from collections.abc import Iterable
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.settings import check_keywords, keywords_of
@@ -27,34 +28,48 @@ def with_suffix(path: Any, suffix: str) -> pathlib.Path:
 class CheckedFiles(BaseAlgorithm):
     """An algorithm whose ``save`` is atomic, and whose ``load`` takes neither files of others nor settings that it lacks."""
 
+    #: Settings of the library's class that follow from others here
+    FOLLOWS: ClassVar[tuple[str, ...]] = ()
+
     @classmethod
     def load(cls: type[SelfCheckedFiles], path: Any, env: Any = None, *args: Any, **kwargs: Any) -> SelfCheckedFiles:
         """
         :param path: file of :meth:`save`
         :param env: to train on, or None to predict, adapt and evaluate
         :param args: further ones of Stable-Baselines3's ``load``, of which ``device`` comes next
-        :param kwargs: these by name, and settings in place of those of the file
+        :param kwargs: these by name, and settings in place of those of the file; of ``replay_buffer_kwargs``, those that are
+            given
         :return: the model
         :raises ValueError: for an unknown setting, or a file of another algorithm
         """
-        check_keywords(cls.__name__, kwargs, cls, also=keywords_of(BaseAlgorithm.load))
+        check_keywords(cls.__name__, kwargs, cls, also=keywords_of(BaseAlgorithm.load), without=cls.FOLLOWS)
         if "stats_window_size" in kwargs:  # has another name in SB3's models
             kwargs["_stats_window_size"] = kwargs.pop("stats_window_size")
         if str(path).endswith(".pt"):
             raise ValueError(f"{path} is no model: an agent that is adapted to a task is loaded by AdaptedAgent.load.")
-        try:
-            model = super().load(path, env, *args, **kwargs)
-        except (KeyError, AttributeError) as error:
-            if "ent_coef" not in kwargs:
-                raise
-            raise ValueError(
-                f"ent_coef is {kwargs['ent_coef']!r}, and that of the file is of the other kind, a number or learnt ('auto'), "
-                "which the rest of the file depends on: leave it out, or train anew."
-            ) from error
+        if {"ent_coef", "replay_buffer_kwargs"} & kwargs.keys():
+            theirs = cls._settings(path, kwargs.get("custom_objects"))
+            if isinstance(kwargs.get("ent_coef"), str) != isinstance(theirs.get("ent_coef"), str) and "ent_coef" in kwargs:
+                raise ValueError(
+                    f"ent_coef is {kwargs['ent_coef']!r}, and that of the file is of the other kind, a number or learnt "
+                    "('auto'), which the rest of the file depends on: leave it out, or train anew."
+                )
+            if "replay_buffer_kwargs" in kwargs:
+                of_both = (theirs.get("replay_buffer_kwargs"), kwargs["replay_buffer_kwargs"])
+                kwargs["replay_buffer_kwargs"] = {name: x for given in of_both for name, x in (given or {}).items()}
+        model = super().load(path, env, *args, **kwargs)
         state = vars(model)
         if "ent_coef_tensor" in state:  # SB3 has put that of the file in the place of one that was given
             state["ent_coef_tensor"] = th.tensor(float(state["ent_coef"]), device=model.device)
         return model
+
+    @staticmethod
+    def _settings(path: Any, custom_objects: dict[str, Any] | None) -> dict[str, Any]:
+        """Of a file."""
+        data, _, _ = load_from_zip_file(path, custom_objects=custom_objects, device="cpu")
+        if isinstance(path, io.IOBase):
+            path.seek(0)
+        return data or {}
 
     def _setup_model(self) -> None:
         self._check_policy_class()

@@ -74,6 +74,17 @@ def check_flags(**flags: Any) -> None:
             raise ValueError(f"{name} is {value!r}, expected True or False.")
 
 
+def check_class(name: str, value: Any, base: type) -> None:
+    """
+    :param name: of a setting
+    :param value: that it has
+    :param base: a class
+    :raises ValueError: for what is no class derived from it, such as the name of one
+    """
+    if not (isinstance(value, type) and issubclass(value, base)):
+        raise ValueError(f"{name} is {value!r}, expected a class derived from {base.__module__}.{base.__qualname__}.")
+
+
 def keywords_of(function: Callable[..., Any]) -> set[str]:
     """
     :param function: or a class

@@ -89,6 +89,8 @@ class BatchedTaskVecEnv(VecEnv):
         return hasattr(self.vector_env, PER_ENV.get(attr_name, attr_name))
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        if attr_name in PER_ENV:
+            raise ValueError(f"A batch takes no {attr_name}: call set_options, with {attr_name!r} for each env, and reset.")
         # For all, as they share what they are made of
         setattr(self.vector_env, attr_name, value)
 

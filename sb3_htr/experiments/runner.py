@@ -91,7 +91,7 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
     import_packages(cell.gym_packages)
     trained = find_finished(cell, folder)
     if trained is None:
-        unfinished = [run for run in folder.glob("*/*") if checkpoints(run)]
+        unfinished = [run for run in sorted(folder.glob("*/*"), key=lambda run: run.stat().st_mtime) if checkpoints(run)]
         packages = ["--gym-packages", *cell.gym_packages] if cell.gym_packages else []
         train.main(["--resume", str(unfinished[-1]), *packages] if unfinished else cell.training(folder))
         trained = find_finished(cell, folder)

@@ -31,7 +31,14 @@ from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.callback import followed_by
 from sb3_htr.common.latent_policy import Obs, State
 from sb3_htr.common.progress import MetaProgressBarCallback
-from sb3_htr.common.random_state import MAX_SEED, get_generator_state, seeded_actions, set_generator_state, stream
+from sb3_htr.common.random_state import (
+    MAX_SEED,
+    checked_seed,
+    get_generator_state,
+    seeded_actions,
+    set_generator_state,
+    stream,
+)
 from sb3_htr.common.saving import CheckedFiles, with_suffix
 from sb3_htr.common.settings import check_keywords, check_numbers, plain
 from sb3_htr.common.training_state import Resumable
@@ -103,17 +110,8 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
     ) -> None:
         checks.check_device(kwargs.get("device", "auto"))
         check_numbers(n_tasks_per_rollout=(n_tasks_per_rollout, 1))
-        if seed is not None:
-            check_numbers(seed=(seed, 0, MAX_SEED))
-            seed = int(seed)  # numpy's are no seeds for Python's own generator
+        seed = checked_seed(seed)
         self.explorer, self.train_explorer = to_explorer(explorer), to_explorer(train_explorer)
-        buffer_class = replay_buffer_class or MultiTaskReplayBuffer
-        if not issubclass(buffer_class, MultiTaskReplayBuffer):
-            raise ValueError(
-                f"replay_buffer_class is {buffer_class.__name__}, expected MultiTaskReplayBuffer, which relabels by itself, "
-                "or a subclass of it: leave it out."
-            )
-        check_keywords("replay_buffer_kwargs", replay_buffer_kwargs or {}, buffer_class, without=GIVEN_BY_MODEL)
         if isinstance(env, str):
             env = make_task_vec_env(env, n_tasks_per_rollout, seed=seed)
         if env is not None:
@@ -122,7 +120,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         super().__init__(
             policy=policy,
             env=env,  # type: ignore[arg-type]
-            replay_buffer_class=buffer_class,
+            replay_buffer_class=replay_buffer_class,
             replay_buffer_kwargs=replay_buffer_kwargs,
             policy_kwargs={} if policy_kwargs is None else dict(policy_kwargs),
             seed=seed,
@@ -147,6 +145,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
     def _setup_model(self) -> None:
         if self.env is None and not hasattr(self, "observation_space"):
             raise ValueError(f"{type(self).__name__} has no env to make its networks for: pass one, or the id of one.")
+        self._check_policy_class()
         # Not in the constructor: settings can be given to load() too, in place of those of the file
         self._complete_settings()
         self.explorer, self.train_explorer = to_explorer(self.explorer), to_explorer(self.train_explorer)
@@ -171,6 +170,14 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         # Without an env, which is for files alone, the settings come from there
         max_episode_steps = n_envs = 1
         check_numbers(n_tasks_per_rollout=(self.n_tasks_per_rollout, 1))
+        self.seed = checked_seed(self.seed)
+        self.replay_buffer_class = buffer_class = self.replay_buffer_class or MultiTaskReplayBuffer
+        if not issubclass(buffer_class, MultiTaskReplayBuffer):
+            raise ValueError(
+                f"replay_buffer_class is {buffer_class.__name__}, expected MultiTaskReplayBuffer, which relabels by itself, "
+                "or a subclass of it: leave it out."
+            )
+        check_keywords("replay_buffer_kwargs", self.replay_buffer_kwargs, buffer_class, without=GIVEN_BY_MODEL)
         if self.env is not None:
             max_episode_steps, n_envs = checks.get_max_episode_steps(self.env), self.env.num_envs
         # All envs are stepped, as often as it takes
@@ -586,7 +593,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
     # Files and state
 
     def _excluded_save_params(self) -> list[str]:
-        own = ["knowledge", "task_bank", "update_listeners", "_warned_not_adapted"]
+        own = ["knowledge", "task_bank", "update_listeners", "_warned_not_adapted", "_rng", "_task_queue"]
         return [*super()._excluded_save_params(), *own]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

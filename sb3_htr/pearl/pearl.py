@@ -176,6 +176,8 @@ class PEARL(OffPolicyMetaAlgorithm):
             kl_coef=(self.kl_coef, 0.0),
             final_kl_coef=(self.kl_coef if self.final_kl_coef is None else self.final_kl_coef, 0.0),
             reward_coef=(self.reward_coef, 0.0),
+            # SAC reads words
+            ent_coef=(0.0 if isinstance(self.ent_coef, str) else self.ent_coef, 0.0),
             tau=(self.tau, 0.0, 1.0),
         )
         if self.tau == 0:

@@ -16,7 +16,7 @@ from torch import nn
 from sb3_htr.common.latent_policy import LatentPolicy
 from sb3_htr.common.linear import Linear, Stack, with_fast_layers
 from sb3_htr.common.normalizer import ObservationNormalizer
-from sb3_htr.common.settings import check_numbers
+from sb3_htr.common.settings import check_class, check_flags, check_numbers
 from sb3_htr.common.type_aliases import Context
 from sb3_htr.pearl.encoder import ContextEncoder, to_encoder_class
 from sb3_htr.pearl.reward_model import RewardModel
@@ -80,6 +80,7 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
     :param n_critics: number of critics
     :param optimizer_class: optimizer of all networks
     :param optimizer_kwargs: its arguments, without the learning rate; Adam is fused unless told otherwise
+    :raises ValueError: for a setting that is none
     """
 
     def __init__(
@@ -97,7 +98,10 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
-        check_numbers(latent_dim=(latent_dim, 1))
+        check_numbers(latent_dim=(latent_dim, 1), n_critics=(n_critics, 1))
+        check_flags(normalize_observations=normalize_observations)
+        check_class("activation_fn", activation_fn, nn.Module)
+        check_class("optimizer_class", optimizer_class, th.optim.Optimizer)
         if optimizer_class is th.optim.Adam and not {"foreach", "differentiable"} & {*(optimizer_kwargs or ())}:
             optimizer_kwargs = {"fused": True, **(optimizer_kwargs or {})}
         self.latent_dim = latent_dim

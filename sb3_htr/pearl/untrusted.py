@@ -12,7 +12,7 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_htr.adaptation import explorers
 from sb3_htr.common.checks import check_spaces
-from sb3_htr.common.errors import last_line
+from sb3_htr.common.errors import OPEN_ERRORS, last_line
 from sb3_htr.common.plain import Refused, read_model
 from sb3_htr.common.saving import with_suffix
 from sb3_htr.common.settings import keywords_of
@@ -59,6 +59,7 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
     :param device: torch device
     :param kwargs: arguments of PEARL, in place of those of the file
     :return: a model to predict, adapt and evaluate with
+    :raises OSError: if there is no such file, or it cannot be opened
     :raises ValueError: if it is no such file, or its weights do not fit
     """
     # As SB3's load does
@@ -81,7 +82,7 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
                 raise Refused(f"PEARL has no {name} of {settings[name]} here: expected {most} at most.")
         counters = {name: data[name] for name in COUNTERS if type(data.get(name)) is int}
         settings["policy_kwargs"] = _policy_kwargs(data.get("policy_kwargs", {}))
-    except (FileNotFoundError, Warning):
+    except (*OPEN_ERRORS, Warning):
         raise
     except Exception as error:  # whatever a stranger can put into a file
         why = f": {error}" if isinstance(error, Refused) else "."

@@ -2,22 +2,27 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.adaptation import Step
+from sb3_htr.adaptation.callbacks import MetaEvalCallback
 from sb3_htr.adaptation.loop import Adapting
-from sb3_htr.common.callback import followed_by
-from sb3_htr.common.checks import check_has_env, check_is_not_normalized
+from sb3_htr.common.callback import followed_by, parts_of
+from sb3_htr.common.checks import check_device, check_has_env, check_is_not_normalized
+from sb3_htr.common.random_state import checked_seed
 from sb3_htr.common.saving import CheckedFiles
+from sb3_htr.common.settings import check_keywords, check_numbers
 from sb3_htr.common.training_state import Resumable
+
+SelfRival = TypeVar("SelfRival", bound="Rival")
 
 
 class OwnWay:
@@ -115,6 +120,21 @@ class Rival(CheckedFiles, Resumable):
     ACTS_WITH: ClassVar[dict[str, Any]] = {}
     explorer = OwnWay()
 
+    def _check_settings(self, policy: Any, seed: int | None, settings: dict[str, Any]) -> int | None:
+        """
+        :param policy: name or class
+        :param seed: of the model
+        :param settings: that are handed on to the library
+        :return: the seed
+        :raises ValueError: for what the library would refuse in words of its own, or not at all
+        """
+        check_device(settings.get("device", "auto"))
+        check_keywords(type(self).__name__, settings, type(self), without=self.FOLLOWS)
+        policy_class = self.policy_aliases.get(policy) if isinstance(policy, str) else policy
+        if policy_class is not None:
+            check_keywords("policy_kwargs", settings.get("policy_kwargs") or {}, policy_class)
+        return checked_seed(seed)
+
     @abstractmethod
     def _adaptation(self, n_envs: int, generator: th.Generator | None) -> Adapting:
         """An adaptation to so many tasks, side by side."""
@@ -134,10 +154,16 @@ class Rival(CheckedFiles, Resumable):
     def check_env(self, env: VecEnv) -> None:
         """
         :param env: to adapt in
-        :raises ValueError: if its spaces are not those of training, or it normalizes
+        :raises ValueError: if its spaces are not those of training, it normalizes, or it is what the model trains on
         """
         check_is_not_normalized(env)
-        check_for_correct_spaces(self._wrap_env(env), self.observation_space, self.action_space)
+        wrapped = self._wrap_env(env)
+        if wrapped is env:
+            raise ValueError(
+                f"This env shows more than its observations, as {type(self).__name__} sees them in training: pass another, "
+                "or its id."
+            )
+        check_for_correct_spaces(wrapped, self.observation_space, self.action_space)
 
     def begin_rollout(self) -> None:
         """Begin new episodes in all envs."""
@@ -145,12 +171,38 @@ class Rival(CheckedFiles, Resumable):
         self._last_obs = self.env.reset()  # type: ignore[assignment]
         self._last_episode_starts = np.ones(self.env.num_envs, dtype=bool)
 
-    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        return super()._init_callback(followed_by(callback, FreshStart()), progress_bar)
-
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+    def learn(
+        self: SelfRival,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 1,
+        *args: Any,
+        **kwargs: Any,
+    ) -> SelfRival:
+        """
+        :param total_timesteps: env steps
+        :param callback: called at each step
+        :param log_interval: rollouts between two logs, None for no logs
+        :param args: see Stable-Baselines3's
+        :param kwargs: likewise
+        :return: the model
+        :raises ValueError: for a model that was loaded without an env, numbers out of their ranges, and SB3's EvalCallback
+        """
         check_has_env(self.env)
-        return super()._setup_learn(*args, **kwargs)
+        check_numbers(total_timesteps=(total_timesteps, 0.0))
+        if log_interval is not None:
+            check_numbers(log_interval=(log_interval, 1))
+        return super().learn(total_timesteps, callback, log_interval, *args, **kwargs)  # type: ignore[arg-type, safe-super]
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        result = followed_by(callback, FreshStart())
+        for part in parts_of(result):
+            if isinstance(part, EvalCallback) and not isinstance(part, MetaEvalCallback):
+                raise ValueError(
+                    f"{type(self).__name__} does not act on the observations that {type(part).__name__} shows it: pass "
+                    "sb3_htr.MetaEvalCallback in its place."
+                )
+        return super()._init_callback(result, progress_bar)
 
 
 def scaled(actions: np.ndarray, space: spaces.Box) -> np.ndarray:

@@ -86,6 +86,7 @@ class RL2(Rival, RecurrentPPO):
     DEFAULT_POLICY: ClassVar[str] = "MlpLstmPolicy"
     ACTS_BY: ClassVar[tuple[str, ...]] = ("n_episodes_per_trial",)
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpLstmPolicy": TrialLstmPolicy}
+    FOLLOWS: ClassVar[tuple[str, ...]] = ("n_steps",)
     policy: RecurrentActorCriticPolicy
     env: TrialVecEnv | None
 
@@ -101,6 +102,7 @@ class RL2(Rival, RecurrentPPO):
         check_numbers(n_episodes_per_trial=(n_episodes_per_trial, 1), n_trials_per_rollout=(n_trials_per_rollout, 1))
         if "n_steps" in kwargs:
             raise ValueError("n_steps follows from n_trials_per_rollout: a rollout is whole trials.")
+        seed = self._check_settings(policy, seed, kwargs)
         if isinstance(env, str):
             env = make_task_vec_env(env, N_ENVS, seed)
         n_steps = 1
@@ -155,15 +157,7 @@ class RL2(Rival, RecurrentPPO):
     def learn(
         self, total_timesteps: int, callback: MaybeCallback = None, log_interval: int | None = 1, *args: Any, **kwargs: Any
     ) -> "RL2":
-        """
-        :param total_timesteps: env steps
-        :param callback: called at each step
-        :param log_interval: rollouts between two logs, None for no logs; those before a training was resumed count, too
-        :param args: see RecurrentPPO's
-        :param kwargs: likewise
-        :return: the model
-        :raises ValueError: for a log interval below 1
-        """
+        """As of all rivals; ``log_interval`` counts the rollouts before a training was resumed, too."""
         if log_interval is not None:
             check_numbers(log_interval=(log_interval, 1))
         self._log_interval = log_interval

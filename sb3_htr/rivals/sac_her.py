@@ -27,12 +27,18 @@ from sb3_htr.common.checks import (
     get_max_episode_steps,
     get_task_family,
 )
-from sb3_htr.common.settings import check_numbers
+from sb3_htr.common.settings import check_keywords, check_numbers
 from sb3_htr.common.type_aliases import Trajectory
 from sb3_htr.common.vec_env import N_ENVS, in_float32, make_task_vec_env
 from sb3_htr.htr.reward_hook import check_rewards_told
 from sb3_htr.rivals.base import Rival, ToldAdaptation, unscaled
 from sb3_htr.rivals.shown_task import ShownTaskVecEnv
+
+# Arguments of the replay buffer that are the model's
+GIVEN_BY_MODEL = (
+    *("buffer_size", "observation_space", "action_space", "env", "device", "n_envs"),
+    *("optimize_memory_usage", "handle_timeout_termination"),
+)
 
 
 class TaskHerReplayBuffer(HerReplayBuffer):
@@ -138,13 +144,15 @@ class SACHER(Rival, SAC):
     :param replay_buffer_kwargs: arguments of SB3's ``HerReplayBuffer``
     :param policy_kwargs: arguments of the policy
     :param seed: seed of all random generators
-    :param kwargs: arguments of ``SAC`` but ``train_freq`` and ``replay_buffer_class``
-    :raises ValueError: for an env without tasks or time limit, or with rewards that are not those of its tasks
+    :param kwargs: arguments of ``SAC`` but those in :attr:`FOLLOWS`
+    :raises ValueError: for a setting that is unknown, an env without tasks or time limit, or with rewards that are not those
+        of its tasks
     """
 
     DEFAULT_POLICY: ClassVar[str] = "MultiInputPolicy"
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": MultiInputPolicy}
     ACTS_WITH: ClassVar[dict[str, Any]] = {"buffer_size": 1}
+    FOLLOWS: ClassVar[tuple[str, ...]] = ("train_freq", "replay_buffer_class", "optimize_memory_usage")
 
     def __init__(
         self,
@@ -157,9 +165,11 @@ class SACHER(Rival, SAC):
         **kwargs: Any,
     ) -> None:
         check_numbers(gradient_steps=(gradient_steps, -1))
-        for name in ("train_freq", "replay_buffer_class"):
+        for name in self.FOLLOWS:
             if name in kwargs:
                 raise ValueError(f"SACHER has no setting {name!r}: a rollout is an episode of each env, and replay is HER's.")
+        seed = self._check_settings(policy, seed, {**kwargs, "policy_kwargs": policy_kwargs})
+        check_keywords("replay_buffer_kwargs", replay_buffer_kwargs or {}, HerReplayBuffer, without=GIVEN_BY_MODEL)
         if isinstance(env, str):
             env = make_task_vec_env(env, N_ENVS, seed)
         super().__init__(

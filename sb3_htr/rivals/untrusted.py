@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 import gymnasium as gym
 
-from sb3_htr.common.errors import last_line
+from sb3_htr.common.errors import OPEN_ERRORS, last_line
 from sb3_htr.common.plain import read_model
 from sb3_htr.rivals.base import Rival
 
@@ -34,6 +34,7 @@ def load_untrusted(
     :param env: env of the same spaces
     :param device: torch device
     :return: a model to adapt and evaluate with
+    :raises OSError: if there is no such file, or it cannot be opened
     :raises ValueError: if it is no such file, or its weights do not fit the settings
     """
     try:
@@ -54,6 +55,8 @@ def load_untrusted(
         settings = {**counts, **model_class.ACTS_WITH, "use_sde": hyperparams.get("use_sde") is True}
         model = model_class(model_class.DEFAULT_POLICY, env, device=device, policy_kwargs=policy_kwargs, **settings)
         model.policy.load_state_dict(weights["policy"])
+    except OPEN_ERRORS:
+        raise
     except Exception as error:  # whatever a stranger can put into a file
         why = last_line(error) if isinstance(error, ValueError | RuntimeError) else ""
         raise ValueError(f"{path} is damaged, or no {model_class.__name__} with the settings of its record: {why}") from None

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecEnv
 
 from helpers import ENV_ID, PRIOR, ROLLOUT, MakePEARL
 from helpers.adaptations import know_tasks
 from htr_envs import PointRobotFamily
 from sb3_htr import PEARL, evaluate_adaptation
-from sb3_htr.adaptation import Belief, Prior
+from sb3_htr.adaptation import Belief, Prior, evaluation
 from sb3_htr.adaptation.evaluation import record_adaptation
 from sb3_htr.common.vec_env import make_task_vec_env
 
@@ -229,3 +230,19 @@ def test_no_two_evaluations_share_noise(tiny_pearl: MakePEARL, monkeypatch: pyte
     for seed in (0, 2):
         record_adaptation(model, env, PointRobotFamily().test_tasks[:4], n_episodes=1, deterministic=False, seed=seed)
     assert len(set(noise)) == len(noise) == 80
+
+
+def test_tasks_have_the_same_episodes_by_name_and_as_an_array(tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = tiny_pearl()
+    made: list[int] = []
+
+    def make(env_id: str, n_envs: int = 1, seed: int | None = None) -> VecEnv:
+        made.append(n_envs)
+        return make_task_vec_env(env_id, n_envs, seed)
+
+    monkeypatch.setattr(evaluation, "make_task_vec_env", make)
+    tasks = PointRobotFamily().test_tasks
+    by_name, as_array = (evaluate_adaptation(model, ENV_ID, x, n_episodes=2)[0] for x in ("test", tasks))
+    np.testing.assert_array_equal(by_name, as_array)
+    evaluate_adaptation(model, ENV_ID, tasks[:3], n_episodes=1)
+    assert max(made) == 20 and made[-1] == 3, "neither 100 envs for as many tasks, nor 20 for three"

@@ -31,6 +31,13 @@ def test_options_of_a_batch_must_agree() -> None:
         env.reset()
 
 
+def test_a_task_that_a_batch_would_not_take_is_refused() -> None:
+    env = make_task_vec_env(ENV_ID, 2)
+    for name in ("task", "task_id"):
+        with pytest.raises(ValueError, match=f"A batch takes no {name}: call set_options, with '{name}' for each env"):
+            env.set_attr(name, 3)
+
+
 def test_only_same_step_autoreset_can_be_an_sb3_vec_env() -> None:
     env = gym.make_vec(ENV_ID, 2, vectorization_mode="sync")
     with pytest.raises(ValueError, match=r"expected AutoresetMode\.SAME_STEP"):

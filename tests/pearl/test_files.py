@@ -10,6 +10,7 @@ import re
 import threading
 import warnings
 import zipfile
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +21,15 @@ import pytest
 import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
-from stable_baselines3 import SAC
+from stable_baselines3 import SAC, HerReplayBuffer
+from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.utils import LinearSchedule
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL, many, parameters, with_policy
 from helpers.bombs import Bomb, bombs
 from sb3_htr import PEARL, AdaptedAgent, evaluate_adaptation, load_untrusted
 from sb3_htr.adaptation import Aggregate, Belief, Prior
+from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr import EpisodeClustering
 from sb3_htr.pearl.pearl import LEARNING_RATE
@@ -394,3 +397,47 @@ def test_what_was_refused_is_not_there(tiny_pearl: MakePEARL, tmp_path: Path) ->
     with pytest.raises(ValueError, match="of another task family"):
         model.load_replay_buffer(tmp_path / "replay")
     assert model.replay_buffer is not None and model.replay_buffer.size() == 0
+
+
+def test_load_takes_replay_settings_beside_those_of_the_file(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    replay = {"relabel_probability": 0.3, "relabeller": {"name": "SingleEpisodeRelabelling", "elsewhere": 0.25}}
+    tiny_pearl(replay_buffer_kwargs=replay).save(tmp_path / "model")
+    given: dict[str, Any] = {"replay_buffer_kwargs": {"context_episodes": 2}}
+    with open(tmp_path / "model.zip", "rb") as file:
+        models = [PEARL.load(tmp_path / "model", **given), PEARL.load(file, **given)]
+    for model in (*models, load_untrusted(tmp_path / "model", ENV_ID, **given)):
+        assert model.replay_buffer_kwargs == {**replay, "context_episodes": 2}
+
+
+def test_settings_given_to_load_are_checked_as_the_constructors(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    tiny_pearl().save(tmp_path / "model")
+    given: tuple[tuple[dict[str, Any], str], ...] = (
+        ({"replay_buffer_kwargs": {"relabel_probabilty": 1}}, "did you mean relabel_probability"),
+        ({"replay_buffer_class": HerReplayBuffer}, "replay_buffer_class is HerReplayBuffer, expected MultiTask"),
+        ({"seed": -1}, "seed is -1, expected a whole number"),
+        ({"ent_coef": -0.1}, "ent_coef is -0.1, expected a number of at least 0"),
+    )
+    for kwargs, message in given:
+        for env in (None, make_task_vec_env(ENV_ID, 4)):
+            with pytest.raises(ValueError, match=message):
+                PEARL.load(tmp_path / "model", env=env, **kwargs)
+
+
+def test_a_file_has_nothing_that_load_makes_anew(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    tiny_pearl().learn(ROLLOUT).save(tmp_path / "model")
+    data, _, _ = load_from_zip_file(tmp_path / "model")
+    assert data is not None and not {"_rng", "_task_queue"} & data.keys()
+    env = make_task_vec_env(ENV_ID, 4)
+    PEARL.load(tmp_path / "model", env=env).learn(ROLLOUT)
+    later = PEARL.load(tmp_path / "model")
+    later.set_env(env)
+    later.learn(ROLLOUT)
+
+
+def test_a_path_that_cannot_be_opened_is_not_called_damaged(tmp_path: Path) -> None:
+    """Only a file that was read is."""
+    folder = tmp_path / "folder.pt"
+    folder.mkdir()
+    for load in (load_arrays, AdaptedAgent.load, partial(load_untrusted, env=ENV_ID)):
+        with pytest.raises(IsADirectoryError):
+            load(folder)

@@ -1,0 +1,82 @@
+"""What a user may ask of a rival by mistake is refused in one sentence, before any work is lost."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from stable_baselines3.common.callbacks import CallbackList, EvalCallback
+
+from helpers import ENV_ID
+from sb3_htr import evaluate_adaptation
+from sb3_htr.adaptation.callbacks import MetaEvalCallback
+from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.rivals.rl2 import RL2
+from sb3_htr.rivals.sac_her import SACHER
+
+RIVALS = pytest.mark.parametrize(("kind", "policy"), [(RL2, "MlpLstmPolicy"), (SACHER, "MultiInputPolicy")])
+
+
+@RIVALS
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"gama": 0.9}, "has no setting 'gama': did you mean gamma"),
+        ({"policy_kwargs": {"net_arc": [8]}}, "policy_kwargs has no setting 'net_arc': did you mean net_arch"),
+        ({"seed": -1}, "seed is -1, expected a whole number"),
+        ({"device": "gpu"}, "The device 'gpu' cannot be used: give cpu, cuda"),
+    ],
+)
+def test_settings(kind: Any, policy: str, settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        kind(policy, ENV_ID, **settings)
+
+
+@pytest.mark.parametrize("name", ["train_freq", "optimize_memory_usage", "replay_buffer_class"])
+def test_what_follows_is_no_setting(name: str, tmp_path: Path) -> None:
+    given: dict[str, Any] = {name: True}
+    with pytest.raises(ValueError, match=f"SACHER has no setting '{name}': a rollout is an episode"):
+        SACHER("MultiInputPolicy", ENV_ID, **given)
+    SACHER("MultiInputPolicy", ENV_ID).save(tmp_path / "model")
+    with pytest.raises(ValueError, match=f"SACHER has no setting '{name}'"):
+        SACHER.load(tmp_path / "model", **given)
+
+
+def test_settings_of_her() -> None:
+    with pytest.raises(ValueError, match="replay_buffer_kwargs has no setting 'n_sampled': did you mean n_sampled_goal"):
+        SACHER("MultiInputPolicy", ENV_ID, replay_buffer_kwargs={"n_sampled": 1})
+
+
+@RIVALS
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda model: model.learn(-1), "total_timesteps is -1, expected a number of at least 0"),
+        (lambda model: model.learn("1e6"), "total_timesteps is '1e6', expected a number"),
+        (lambda model: model.learn(40, log_interval=0), "log_interval is 0, expected a whole number"),
+        (lambda model: evaluate_adaptation(model, model.get_env(), n_episodes=1), "shows more than its observations"),
+    ],
+)
+def test_calls(kind: Any, policy: str, call: Callable[[Any], Any], message: str) -> None:
+    model = kind(policy, make_task_vec_env(ENV_ID, 2, 0))
+    with pytest.raises(ValueError, match=message):
+        call(model)
+    assert model.num_timesteps == 0
+
+
+@RIVALS
+def test_sb3s_evaluation_is_refused_before_training(kind: Any, policy: str) -> None:
+    model = kind(policy, make_task_vec_env(ENV_ID, 2, 0))
+    theirs = EvalCallback(make_task_vec_env(ENV_ID, 1, 0), eval_freq=1)
+    for callback in (theirs, [theirs], CallbackList([CallbackList([theirs])])):
+        with pytest.raises(ValueError, match=r"does not act on the observations that EvalCallback shows it: pass .*MetaEval"):
+            model.learn(40, callback)
+    assert model.num_timesteps == 0
+    ours = MetaEvalCallback(ENV_ID, n_eval_episodes=1, eval_freq=20, verbose=0)
+    model.learn(40, ours)
+    assert ours.evaluations_timesteps
+
+
+def test_an_evaluation_that_would_show_no_window() -> None:
+    with pytest.raises(ValueError, match="An evaluation shows no window: leave render out"):
+        MetaEvalCallback(ENV_ID, render=True)
