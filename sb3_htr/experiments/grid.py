@@ -156,12 +156,13 @@ TUNED_DENSE: KwArgs = {
 }
 
 
-def settings_of(file: str) -> KwArgs:
+def settings_of(file: str, env_id: str = "default") -> KwArgs:
     """
     :param file: name of a YAML file of the package
-    :return: what it says for all envs, but for what an experiment and its methods say themselves
+    :param env_id: an env that has a block of its own in it; by default what the file says for all others
+    :return: what it says, but for what an experiment and its methods say themselves
     """
-    block: KwArgs = yaml.safe_load(hyperparams_file(file).read_text())["default"]
+    block: KwArgs = yaml.safe_load(hyperparams_file(file).read_text())[env_id]
     return {key: value for key, value in block.items() if key not in ("policy", "method", "n_timesteps")}
 
 
@@ -201,6 +202,18 @@ ALL = (
         150_000,
         tuple(Variant(method, settings=settings_of("pearl_prior.yml")) for method in ("htr-ser-prior", "pearl-dense-prior")),
         evaluations=by(("prior", "prior, 10 exploration episodes", "belief")),
+    ),
+    Experiment(
+        "wheeled_prior",
+        "The same on a robot with wheels.",
+        WHEELED,
+        300_000,
+        tuple(
+            Variant(method, settings=settings_of("pearl_prior.yml", WHEELED))
+            for method in ("htr-ser-prior", "pearl-dense-prior")
+        ),
+        eval_freq=100_000,
+        evaluations=by(("prior", "belief")),
     ),
     Experiment(
         "ablation",
