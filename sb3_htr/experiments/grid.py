@@ -216,6 +216,14 @@ ALL = (
         evaluations=by(("prior", "belief")),
     ),
     Experiment(
+        "learned_prior",
+        "PEARL's protocol, in rollouts and at meta-test, with a prior that is learned.",
+        POINT,
+        150_000,
+        (Variant("htr-ser", "htr-ser, learned prior", {name: "learned-prior" for name in ("explorer", "train_explorer")}),),
+        evaluations=by(("learned-prior", "belief"), {}, {"goal_distance": 0.8}, {"goal_distance": 1.2}),
+    ),
+    Experiment(
         "ablation",
         "The default explorer without one of its parts, with the same models.",
         POINT,

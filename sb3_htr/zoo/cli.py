@@ -24,6 +24,8 @@ COMMANDS = {
     "export": "a small file to share, with a model card; can upload both to the Hugging Face Hub",
     "load_from_hub": "download an agent from there",
 }
+# Experiments use the commands of the zoo, and not the other way round
+MODULES = {name: f"sb3_htr.zoo.commands.{name}" for name in COMMANDS} | {"experiment": "sb3_htr.experiments.command"}
 USAGE = (
     "usage: sb3-htr COMMAND [ARGUMENTS]; sb3-htr COMMAND --help explains the arguments, sb3-htr --version the versions.\n\n"
     + "\n".join(f"  {name:<13} {text}" for name, text in COMMANDS.items())
@@ -71,7 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     command, *rest = arguments
     try:
-        importlib.import_module(f"sb3_htr.zoo.commands.{command}").main(rest)
+        importlib.import_module(MODULES[command]).main(rest)
     except ModuleNotFoundError as error:
         package = (error.name or "").split(".")[0]
         if package in rest:

@@ -1,14 +1,14 @@
 """``sb3-htr experiment``: repeat an experiment of this project, all its runs and its tables and pictures."""
 
 import argparse
-import importlib
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from sb3_htr.common.settings import check_numbers
+from sb3_htr.experiments import driver, executors, grid, report
+from sb3_htr.experiments.cell import Cell
 from sb3_htr.zoo.commands.arguments import OF_PACKAGES, make_parser
 from sb3_htr.zoo.run.trust import import_packages
 
@@ -20,10 +20,6 @@ EXAMPLE = """  sb3-htr experiment point_robot --jobs 2
 
 def main(argv: Sequence[str]) -> None:
     """The command, with its arguments."""
-    # Experiments use the zoo, and not the other way round
-    driver, executors, grid, report = (
-        importlib.import_module(f"sb3_htr.experiments.{name}") for name in ("driver", "executors", "grid", "report")
-    )
     own = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     own.add_argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help=OF_PACKAGES)
     # Before the names of experiments are asked for
@@ -77,7 +73,7 @@ def main(argv: Sequence[str]) -> None:
     print(f"Results: {output}")
 
 
-def finished(cells: Sequence[Any], runs: Path) -> dict[Any, Path]:
+def finished(cells: Sequence[Cell], runs: Path) -> dict[Cell, Path]:
     """
     :param cells: of an experiment
     :param runs: folder of all experiments' runs
