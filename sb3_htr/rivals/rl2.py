@@ -103,6 +103,11 @@ class RL2(Rival, RecurrentPPO):
         if "n_steps" in kwargs:
             raise ValueError("n_steps follows from n_trials_per_rollout: a rollout is whole trials.")
         seed = self._check_settings(policy, seed, kwargs)
+        if isinstance(env, TrialVecEnv) and env.n_episodes != n_episodes_per_trial:
+            raise ValueError(
+                f"This env has trials of {env.n_episodes} episodes, as another model asked for, and n_episodes_per_trial is "
+                f"{n_episodes_per_trial}: pass an env of its own, or its id."
+            )
         if isinstance(env, str):
             env = make_task_vec_env(env, N_ENVS, seed)
         n_steps = 1

@@ -42,6 +42,13 @@ def test_what_follows_is_no_setting(name: str, tmp_path: Path) -> None:
         SACHER.load(tmp_path / "model", **given)
 
 
+def test_two_models_do_not_share_trials_of_two_lengths() -> None:
+    first = RL2("MlpLstmPolicy", make_task_vec_env(ENV_ID, 2, 0), n_episodes_per_trial=2)
+    with pytest.raises(ValueError, match="trials of 2 episodes, as another model asked for, and n_episodes_per_trial is 5"):
+        RL2("MlpLstmPolicy", first.get_env())
+    assert first.env is not None and first.env.n_episodes == 2
+
+
 def test_settings_of_her() -> None:
     with pytest.raises(ValueError, match="replay_buffer_kwargs has no setting 'n_sampled': did you mean n_sampled_goal"):
         SACHER("MultiInputPolicy", ENV_ID, replay_buffer_kwargs={"n_sampled": 1})

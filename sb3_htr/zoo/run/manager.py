@@ -143,7 +143,7 @@ class MetaExperimentManager(ExperimentManager):
             facts |= {name: str(value) for name, value in given.items()}
         for name, value in facts.items():
             # Older studies do not say
-            if (known := study.user_attrs.get(name, value)) not in (value, "of the YAML file"):
+            if (known := study.user_attrs.get(name, value)) != value:
                 raise ValueError(
                     f"The study {study.study_name!r} is of {name} {known}, and not {value}: give --{name} as there, or search "
                     "under another --study-name."
