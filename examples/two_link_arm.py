@@ -1,6 +1,6 @@
 """A task family of one's own in one file: the tip of a two-link arm must find a goal, anywhere in a ring around its shoulder.
 
-    python examples/two_link_arm.py                                                     # meta-train and adapt, ten minutes
+    python examples/two_link_arm.py                                                     # meta-train and adapt, some minutes
     sb3-htr train --env TwoLinkArm-v0 --gym-packages examples.two_link_arm -n 200000    # the same from the command line
 
 A random arm touches a given goal in one of 200 episodes, and goals lie in all directions and at several distances: nothing
