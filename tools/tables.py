@@ -15,6 +15,7 @@ HEADLINE = {
     "point_robot": ("htr-ser", "pearl-dense", "pearl-sparse"),
     "prior": ("htr-ser-prior", "pearl-dense-prior"),
     "wheeled": ("htr-ser", "pearl-dense", "pearl-sparse"),
+    "wheeled_prior": ("htr-ser-prior", "pearl-dense-prior"),
     "ant": ("htr-ser", "pearl-dense"),
     "fetch_reach": ("htr-ser", "pearl-sparse"),
     "fetch_push": ("htr-ser", "pearl-sparse"),
