@@ -205,7 +205,7 @@ ALL = (
     ),
     Experiment(
         "wheeled_prior",
-        "The same on a robot with wheels.",
+        "The same on a robot with wheels: HTR, and the dense proxy reward.",
         WHEELED,
         300_000,
         tuple(
