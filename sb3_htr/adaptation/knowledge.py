@@ -1,6 +1,6 @@
 """What meta-training knows about tasks before one of them gave any reward."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch as th
@@ -52,7 +52,6 @@ class LatentKnowledge(nn.Module):
     cholesky: th.Tensor
     threshold: th.Tensor
     task_free_value: th.Tensor
-    unsolved: th.Tensor
     n_particles: th.Tensor
     z: th.Tensor
     gain: th.Tensor
@@ -70,17 +69,10 @@ class LatentKnowledge(nn.Module):
         self.register_buffer("threshold", th.tensor(INITIAL_THRESHOLD))
         # Discounted sum of what unrewarded steps return, forever
         self.register_buffer("task_free_value", th.zeros(()))
-        # Share of the training tasks that were not solved yet
-        self.register_buffer("unsolved", th.zeros(()))
         self.register_buffer("n_particles", th.zeros((), dtype=th.int64))
         for name, shape in (("z", (n, latent_dim)), ("gain", (n, n)), ("returns", (n, n)), ("log_prior", (n,))):
             self.register_buffer(name, th.zeros(shape))
         self.register_buffer("is_train", th.zeros(n, dtype=th.bool))
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        # Older models do not say: they were trained to their end
-        state_dict.setdefault(f"{prefix}unsolved", th.zeros(()))
-        super()._load_from_state_dict(state_dict, prefix, *args)
 
     @property
     def tells_success(self) -> bool:
@@ -120,7 +112,6 @@ class LatentKnowledge(nn.Module):
             with th.no_grad():
                 particles = self._solved(policy, bank, gamma)
             self.set_particles(particles)
-            self.unsolved.fill_(1 - bank.n_train_solved / bank.n_train)
             bank.rank(particles.log_prior.cpu().numpy())
 
     def set_aggregate(self, means: th.Tensor) -> None:

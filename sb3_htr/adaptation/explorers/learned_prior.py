@@ -18,13 +18,12 @@ if TYPE_CHECKING:
 class LearnedPrior(FixedExploration, ParticleExplorer):
     """
     Posterior sampling, as PEARL has it, with an empirical prior in place of N(0, I): the posterior means of solved training
-    tasks, all alike, and of hindsight tasks. These have the share of the training tasks that are not solved yet, so that
-    rollouts find them, and a small one in the end. z is drawn from it for a fixed number of episodes, and then from the
-    posterior over all episodes, their misses included. One z an episode.
+    tasks, all alike, and with a small share those of hindsight tasks. z is drawn from it for a fixed number of episodes, and
+    then from the posterior over all episodes, their misses included. One z an episode.
 
     :param n_exploration_episodes: 0 or more episodes before the posterior is used (PEARL's reference, num_exp_traj_eval: 5)
-    :param hindsight_share: in [0, 1], of the prior, at least. By measurement, docs/trials.md: without, no task is found that
-        lies elsewhere than those of training
+    :param hindsight_share: in [0, 1], of the prior. By measurement, docs/trials.md: without, no task is found that lies
+        elsewhere than those of training
     :raises ValueError: for a setting out of its range
     """
 
@@ -39,8 +38,8 @@ class LearnedPrior(FixedExploration, ParticleExplorer):
         super().start()
         prior, is_train = self.particles.log_prior.softmax(dim=0), self.particles.is_train
         if is_train.any() and not is_train.all():
-            share = self.adaptation.knowledge.unsolved.clamp(min=self.hindsight_share)
-            prior = th.where(is_train, (1 - share) / is_train.sum(), share * prior / prior[~is_train].sum())
+            of_hindsight = self.hindsight_share * prior / prior[~is_train].sum()
+            prior = th.where(is_train, (1 - self.hindsight_share) / is_train.sum(), of_hindsight)
         self._prior = prior.log()
         self.log_weights[:] = self._prior
         self.draw(np.arange(len(self.z)))
