@@ -213,7 +213,7 @@ ALL = (
             for method in ("htr-ser-prior", "pearl-dense-prior")
         ),
         eval_freq=100_000,
-        evaluations=by(("prior", "belief")),
+        evaluations=by(("prior", "prior, 10 exploration episodes", "belief")),
     ),
     Experiment(
         "learned_prior",
