@@ -30,7 +30,8 @@ class DiscGoalFamily(PositionGoalFamily):
     """
 
     def __init__(self, farthest: float = 3.0, goal_radius: float = 0.75, task_seed: int = 1337) -> None:
-        self.farthest = farthest
+        # An episode ends at a fall, which a dense reward must not pay for
+        self.farthest = self.dense_level = farthest
         tasks = self.sample_tasks(220, np.random.default_rng(task_seed))
         super().__init__(LOCOMOTION_ARENA, goal_radius, tasks[:100], tasks[100:120], tasks[120:])
 

@@ -23,6 +23,10 @@ class PositionGoalFamily(TaskFamily):
     :raises ValueError: if the radius is out of range.
     """
 
+    #: Dense reward at the goal. Where a fall ends an episode, it is as far as a goal may be from the start: else all dense
+    #: rewards are costs, and to fall early saves them
+    dense_level: float = 0.0
+
     def __init__(
         self,
         arena: float,
@@ -49,20 +53,16 @@ class PositionGoalFamily(TaskFamily):
     def compute_reward(self, traj: Trajectory, task: ArrayLike, reward_type: str = "sparse") -> FloatArray:
         """Goal reward plus task-free reward of every step.
 
-        :param reward_type: ``"sparse"``: 0 for the goal where it is not reached. ``"dense"``: minus the distance to the goal,
-            or what the family has in its place.
+        :param reward_type: ``"sparse"``: 0 for the goal where it is not reached. ``"dense"``: :attr:`dense_level` minus the
+            distance to the goal.
         """
         check_reward_type(reward_type)
         distance = self._distance(traj, task)
         if reward_type == "dense":
-            goal_reward = self._dense_reward(distance)
+            goal_reward = np.float32(self.dense_level) - distance
         else:
             goal_reward = np.where(distance < self.goal_radius, np.float32(1.0) - distance, np.float32(0.0))
         return np.asarray(goal_reward + traj.task_free_reward, dtype=np.float32)
-
-    def _dense_reward(self, distance: FloatArray) -> FloatArray:
-        """Of steps that end so far from the goal."""
-        return -distance
 
     def is_success(self, traj: Trajectory, task: ArrayLike) -> BoolArray:
         """Whether the next state of every step is within the goal radius."""

@@ -89,6 +89,4 @@ class AntGoalFamily(LocomotionFamily):
 
     def __init__(self, goal_distance: float = 2.0, goal_radius: float = 0.4, **task_sets: Any) -> None:
         super().__init__(goal_distance, goal_radius, **task_sets)
-
-    def _dense_reward(self, distance: FloatArray) -> FloatArray:
-        return np.float32(self.goal_distance) - distance
+        self.dense_level = self.goal_distance

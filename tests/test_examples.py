@@ -116,3 +116,14 @@ def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     runpy.run_path(str(tmp_path / "notebook.py"))
     plt.close("all")
     assert not any(cell.get("outputs") for cell in notebook["cells"]), "outputs are not kept: they would go out of date"
+
+
+@pytest.mark.parametrize("env_id", ["SparseAnt-v0", "AntGoalDisc-v0"])
+def test_a_dense_reward_does_not_pay_an_ant_for_falling(env_id: str) -> None:
+    """Which ends its episode: what it earns where it starts is no cost, whichever goal is the task."""
+    importlib.import_module("examples.ant_goal_disc")
+    env = gym.make(env_id, reward_type="dense")
+    for i in range(0, len(env.get_wrapper_attr("train_tasks")), 10):
+        env.reset(seed=0, options={"task_id": i})
+        _, reward, *_ = env.step(np.zeros(8, dtype=np.float32))
+        assert float(reward) > -0.02, i
