@@ -28,8 +28,20 @@ def with_suffix(path: Any, suffix: str) -> pathlib.Path:
 class CheckedFiles(BaseAlgorithm):
     """An algorithm whose ``save`` is atomic, and whose ``load`` takes neither files of others nor settings that it lacks."""
 
-    #: Settings of the library's class that follow from others here
-    FOLLOWS: ClassVar[tuple[str, ...]] = ()
+    #: Settings of the library's class that are none here, and why
+    FOLLOWS: ClassVar[dict[str, str]] = {}
+
+    @classmethod
+    def check_names(cls, given: Iterable[str], also: Iterable[str] = ()) -> None:
+        """
+        :param given: names of settings
+        :param also: names that are known elsewhere
+        :raises ValueError: for the first that it does not have
+        """
+        for name in given:
+            if name in cls.FOLLOWS:
+                raise ValueError(f"{cls.__name__} has no setting {name!r}: {cls.FOLLOWS[name]}.")
+        check_keywords(cls.__name__, given, cls, also)
 
     @classmethod
     def load(cls: type[SelfCheckedFiles], path: Any, env: Any = None, *args: Any, **kwargs: Any) -> SelfCheckedFiles:
@@ -42,14 +54,14 @@ class CheckedFiles(BaseAlgorithm):
         :return: the model
         :raises ValueError: for an unknown setting, or a file of another algorithm
         """
-        check_keywords(cls.__name__, kwargs, cls, also=keywords_of(BaseAlgorithm.load), without=cls.FOLLOWS)
+        cls.check_names(kwargs, keywords_of(BaseAlgorithm.load))
         if "stats_window_size" in kwargs:  # has another name in SB3's models
             kwargs["_stats_window_size"] = kwargs.pop("stats_window_size")
         if str(path).endswith(".pt"):
             raise ValueError(f"{path} is no model: an agent that is adapted to a task is loaded by AdaptedAgent.load.")
         if {"ent_coef", "replay_buffer_kwargs"} & kwargs.keys():
             theirs = cls._settings(path, kwargs.get("custom_objects"))
-            if isinstance(kwargs.get("ent_coef"), str) != isinstance(theirs.get("ent_coef"), str) and "ent_coef" in kwargs:
+            if "ent_coef" in kwargs and isinstance(kwargs["ent_coef"], str) != isinstance(theirs.get("ent_coef"), str):
                 raise ValueError(
                     f"ent_coef is {kwargs['ent_coef']!r}, and that of the file is of the other kind, a number or learnt "
                     "('auto'), which the rest of the file depends on: leave it out, or train anew."

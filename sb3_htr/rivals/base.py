@@ -129,7 +129,7 @@ class Rival(CheckedFiles, Resumable):
         :raises ValueError: for what the library would refuse in words of its own, or not at all
         """
         check_device(settings.get("device", "auto"))
-        check_keywords(type(self).__name__, settings, type(self), without=self.FOLLOWS)
+        self.check_names(settings)
         policy_class = self.policy_aliases.get(policy) if isinstance(policy, str) else policy
         if policy_class is not None:
             check_keywords("policy_kwargs", settings.get("policy_kwargs") or {}, policy_class)
@@ -182,7 +182,7 @@ class Rival(CheckedFiles, Resumable):
         """
         :param total_timesteps: env steps
         :param callback: called at each step
-        :param log_interval: rollouts between two logs, None for no logs
+        :param log_interval: rollouts between two logs, None for no logs; those before a training was resumed count, too
         :param args: see Stable-Baselines3's
         :param kwargs: likewise
         :return: the model
@@ -192,12 +192,26 @@ class Rival(CheckedFiles, Resumable):
         check_numbers(total_timesteps=(total_timesteps, 0.0))
         if log_interval is not None:
             check_numbers(log_interval=(log_interval, 1))
-        return super().learn(total_timesteps, callback, log_interval, *args, **kwargs)  # type: ignore[arg-type, safe-super]
+        self._log_interval = log_interval
+        # The library counts from where a training was resumed; a rival asks :attr:`logs_now`
+        return super().learn(total_timesteps, callback, 1, *args, **kwargs)  # type: ignore[safe-super]
+
+    def logs_now(self, n_rollouts: int) -> bool:
+        """
+        :param n_rollouts: since the beginning of the training, which may have been resumed
+        :return: whether a log is due
+        """
+        return self._log_interval is not None and n_rollouts % self._log_interval == 0
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_log_interval"]
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         result = followed_by(callback, FreshStart())
         for part in parts_of(result):
-            if isinstance(part, EvalCallback) and not isinstance(part, MetaEvalCallback):
+            if not isinstance(part, EvalCallback) or isinstance(part, MetaEvalCallback):
+                continue
+            if part.eval_env.observation_space != self.observation_space:
                 raise ValueError(
                     f"{type(self).__name__} does not act on the observations that {type(part).__name__} shows it: pass "
                     "sb3_htr.MetaEvalCallback in its place."

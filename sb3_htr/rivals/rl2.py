@@ -7,7 +7,7 @@ import torch as th
 from sb3_contrib import RecurrentPPO
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.adaptation import Step
@@ -86,7 +86,7 @@ class RL2(Rival, RecurrentPPO):
     DEFAULT_POLICY: ClassVar[str] = "MlpLstmPolicy"
     ACTS_BY: ClassVar[tuple[str, ...]] = ("n_episodes_per_trial",)
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpLstmPolicy": TrialLstmPolicy}
-    FOLLOWS: ClassVar[tuple[str, ...]] = ("n_steps",)
+    FOLLOWS: ClassVar[dict[str, str]] = {"n_steps": "it follows from n_trials_per_rollout, as a rollout is whole trials"}
     policy: RecurrentActorCriticPolicy
     env: TrialVecEnv | None
 
@@ -100,8 +100,6 @@ class RL2(Rival, RecurrentPPO):
         **kwargs: Any,
     ) -> None:
         check_numbers(n_episodes_per_trial=(n_episodes_per_trial, 1), n_trials_per_rollout=(n_trials_per_rollout, 1))
-        if "n_steps" in kwargs:
-            raise ValueError("n_steps follows from n_trials_per_rollout: a rollout is whole trials.")
         seed = self._check_settings(policy, seed, kwargs)
         if isinstance(env, TrialVecEnv) and env.n_episodes != n_episodes_per_trial:
             raise ValueError(
@@ -159,26 +157,13 @@ class RL2(Rival, RecurrentPPO):
                 "an env of the same time limit, or make a new model."
             )
 
-    def learn(
-        self, total_timesteps: int, callback: MaybeCallback = None, log_interval: int | None = 1, *args: Any, **kwargs: Any
-    ) -> "RL2":
-        """As of all rivals; ``log_interval`` counts the rollouts before a training was resumed, too."""
-        if log_interval is not None:
-            check_numbers(log_interval=(log_interval, 1))
-        self._log_interval = log_interval
-        super().learn(total_timesteps, callback, 1, *args, **kwargs)
-        return self
-
     def dump_logs(self, iteration: int = 0) -> None:
         """
         :param iteration: not used: rollouts are counted from the beginning of the training, which may have been resumed
         """
         n_rollouts = self.num_timesteps // (self.n_steps * self.n_envs)
-        if self._log_interval is not None and n_rollouts % self._log_interval == 0:
+        if self.logs_now(n_rollouts):
             super().dump_logs(n_rollouts)
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_log_interval"]
 
     def _adaptation(self, n_envs: int, generator: th.Generator | None) -> Adapting:
         return TrialAdaptation(self.policy, n_envs, self.n_episodes_per_trial)

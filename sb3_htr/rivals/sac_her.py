@@ -152,7 +152,11 @@ class SACHER(Rival, SAC):
     DEFAULT_POLICY: ClassVar[str] = "MultiInputPolicy"
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": MultiInputPolicy}
     ACTS_WITH: ClassVar[dict[str, Any]] = {"buffer_size": 1}
-    FOLLOWS: ClassVar[tuple[str, ...]] = ("train_freq", "replay_buffer_class", "optimize_memory_usage")
+    FOLLOWS: ClassVar[dict[str, str]] = {
+        "train_freq": "a rollout is an episode of each env",
+        "replay_buffer_class": "replay is HER's",
+        "optimize_memory_usage": "HER's replay does without",
+    }
 
     def __init__(
         self,
@@ -165,9 +169,6 @@ class SACHER(Rival, SAC):
         **kwargs: Any,
     ) -> None:
         check_numbers(gradient_steps=(gradient_steps, -1))
-        for name in self.FOLLOWS:
-            if name in kwargs:
-                raise ValueError(f"SACHER has no setting {name!r}: a rollout is an episode of each env, and replay is HER's.")
         seed = self._check_settings(policy, seed, {**kwargs, "policy_kwargs": policy_kwargs})
         check_keywords("replay_buffer_kwargs", replay_buffer_kwargs or {}, HerReplayBuffer, without=GIVEN_BY_MODEL)
         if isinstance(env, str):
@@ -253,11 +254,11 @@ class SACHER(Rival, SAC):
         self.replay_buffer.truncate_last_trajectory()
 
     def collect_rollouts(self, env: VecEnv, callback: BaseCallback, *args: Any, **kwargs: Any) -> RolloutReturn:
-        """As SAC's, but ``log_interval`` counts rollouts instead of episodes."""
-        log_interval = kwargs.pop("log_interval", None)
+        """As SAC's, but logs are so many rollouts apart, and not episodes."""
+        kwargs.pop("log_interval", None)
         rollout = super().collect_rollouts(env, callback, *args, **kwargs)
         n_rollouts = self.num_timesteps // (self.n_envs * self.train_freq.frequency)  # type: ignore[union-attr]
-        if log_interval is not None and rollout.continue_training and n_rollouts % log_interval == 0:
+        if rollout.continue_training and self.logs_now(n_rollouts):
             self.dump_logs()
         return rollout
 

@@ -35,7 +35,7 @@ def test_settings(kind: Any, policy: str, settings: dict[str, Any], message: str
 @pytest.mark.parametrize("name", ["train_freq", "optimize_memory_usage", "replay_buffer_class"])
 def test_what_follows_is_no_setting(name: str, tmp_path: Path) -> None:
     given: dict[str, Any] = {name: True}
-    with pytest.raises(ValueError, match=f"SACHER has no setting '{name}': a rollout is an episode"):
+    with pytest.raises(ValueError, match=f"SACHER has no setting '{name}': .*(episode of each env|HER's)"):
         SACHER("MultiInputPolicy", ENV_ID, **given)
     SACHER("MultiInputPolicy", ENV_ID).save(tmp_path / "model")
     with pytest.raises(ValueError, match=f"SACHER has no setting '{name}'"):
@@ -79,6 +79,7 @@ def test_sb3s_evaluation_is_refused_before_training(kind: Any, policy: str) -> N
         with pytest.raises(ValueError, match=r"does not act on the observations that EvalCallback shows it: pass .*MetaEval"):
             model.learn(40, callback)
     assert model.num_timesteps == 0
+    model.learn(40, EvalCallback(model._wrap_env(make_task_vec_env(ENV_ID, 1, 0)), eval_freq=20, verbose=0))
     ours = MetaEvalCallback(ENV_ID, n_eval_episodes=1, eval_freq=20, verbose=0)
     model.learn(40, ours)
     assert ours.evaluations_timesteps

@@ -122,7 +122,7 @@ def test_a_rollout_is_whole_trials_and_a_minibatch_some_of_them() -> None:
     [
         ({"n_episodes_per_trial": 0}, "n_episodes_per_trial is 0, expected a whole number of at least 1"),
         ({"n_trials_per_rollout": 0}, "n_trials_per_rollout is 0, expected a whole number of at least 1"),
-        ({"n_steps": 128}, "n_steps follows from n_trials_per_rollout"),
+        ({"n_steps": 128}, "RL2 has no setting 'n_steps': it follows from n_trials_per_rollout"),
         ({"env": "Pendulum-v1"}, "no task_family"),
     ],
 )
