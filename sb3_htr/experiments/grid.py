@@ -132,6 +132,7 @@ FETCH = "HiddenFetchReach-v0"
 
 # The Point Robot's goals: as in training, nearer, and further away
 DISTANCES: tuple[KwArgs, ...] = ({}, {"goal_distance": 0.8}, {"goal_distance": 1.2}, {"goal_distance": 1.4})
+UNDER_PRIOR = by(("prior", "prior, 10 exploration episodes", "belief"))
 # Robots take long to simulate: the default, PEARL's protocol with either prior; and the default further away
 OF_ROBOTS = (*by(("belief", "learned-prior", "prior")), *by(BELIEF, {"goal_distance": 2.5}))
 
@@ -164,6 +165,15 @@ def settings_of(file: str, env_id: str = "default") -> KwArgs:
     """
     block: KwArgs = yaml.safe_load(hyperparams_file(file).read_text())[env_id]
     return {key: value for key, value in block.items() if key not in ("policy", "method", "n_timesteps")}
+
+
+def under_prior(env_id: str = "default") -> tuple[Variant, ...]:
+    """
+    :param env_id: as for :func:`settings_of`
+    :return: HTR, and the dense proxy, under PEARL's own protocol with the settings made for it
+    """
+    settings = settings_of("pearl_prior.yml", env_id)
+    return tuple(Variant(method, settings=settings) for method in ("htr-ser-prior", "pearl-dense-prior"))
 
 
 # PEARL's methods on robots; the budgets of the two others are those of their YAML files
@@ -200,27 +210,24 @@ ALL = (
         "PEARL's own protocol, in rollouts and at meta-test, with settings made for it: HTR, and the dense proxy reward.",
         POINT,
         150_000,
-        tuple(Variant(method, settings=settings_of("pearl_prior.yml")) for method in ("htr-ser-prior", "pearl-dense-prior")),
-        evaluations=by(("prior", "prior, 10 exploration episodes", "belief")),
+        under_prior(),
+        evaluations=UNDER_PRIOR,
     ),
     Experiment(
         "wheeled_prior",
         "The same on a robot with wheels: HTR, and the dense proxy reward.",
         WHEELED,
         300_000,
-        tuple(
-            Variant(method, settings=settings_of("pearl_prior.yml", WHEELED))
-            for method in ("htr-ser-prior", "pearl-dense-prior")
-        ),
+        under_prior(WHEELED),
         eval_freq=100_000,
-        evaluations=by(("prior", "prior, 10 exploration episodes", "belief")),
+        evaluations=UNDER_PRIOR,
     ),
     Experiment(
         "learned_prior",
         "PEARL's protocol, in rollouts and at meta-test, with a prior that is learned.",
         POINT,
         150_000,
-        (Variant("htr-ser", "htr-ser, learned prior", {name: "learned-prior" for name in ("explorer", "train_explorer")}),),
+        (Variant("htr-ser", "htr-ser, learned prior", dict.fromkeys(("explorer", "train_explorer"), "learned-prior")),),
         evaluations=by(("learned-prior", "belief"), {}, {"goal_distance": 0.8}, {"goal_distance": 1.2}),
     ),
     Experiment(

@@ -18,10 +18,10 @@ from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.log import logged
 from sb3_htr.experiments.protocol import evaluate
 from sb3_htr.zoo.commands import train
-from sb3_htr.zoo.run.agents import RECORD, agent_at, find_runs, is_finished, n_steps_of, read_record
+from sb3_htr.zoo.run.agents import RECORD, agent_at, file_stem, find_runs, is_finished, n_steps_of, read_record
 from sb3_htr.zoo.run.algorithm import Model
 from sb3_htr.zoo.run.defaults import training_facts
-from sb3_htr.zoo.run.folder import SystemLock
+from sb3_htr.zoo.run.folder import SystemLock, run_number
 from sb3_htr.zoo.run.method import get_method, merged
 from sb3_htr.zoo.run.time_to_learned import seconds_at
 from sb3_htr.zoo.run.trust import import_packages
@@ -91,7 +91,8 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
     import_packages(cell.gym_packages)
     trained = find_finished(cell, folder)
     if trained is None:
-        unfinished = [run for run in sorted(folder.glob("*/*"), key=lambda run: run.stat().st_mtime) if checkpoints(run)]
+        numbered = sorted(folder.glob("*/*"), key=lambda run: run_number(run, file_stem(cell.env_id)))
+        unfinished = [run for run in numbered if checkpoints(run)]
         packages = ["--gym-packages", *cell.gym_packages] if cell.gym_packages else []
         train.main(["--resume", str(unfinished[-1]), *packages] if unfinished else cell.training(folder))
         trained = find_finished(cell, folder)

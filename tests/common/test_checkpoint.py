@@ -12,6 +12,7 @@ import torch as th
 from helpers.bombs import Bomb
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checkpoint import MANIFEST, STATE, DamagedCheckpoint, read_checkpoint, write_checkpoint
+from sb3_htr.common.random_state import get_global_state, set_global_state
 from sb3_htr.common.resume import checkpoints, load_latest
 
 
@@ -132,3 +133,11 @@ def test_who_wrote_a_checkpoint_may_be_unknown(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr("sb3_htr.common.checkpoint.versions", lambda: {"python": "3"})
     write_checkpoint(tmp_path / "1_steps", {"x": 1})
     assert read_checkpoint(tmp_path / "1_steps") == {"x": 1}
+
+
+def test_a_training_on_the_cpu_starts_no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(th.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(th.cuda, "get_rng_state_all", lambda: pytest.fail("asks a GPU that nobody uses"))
+    state = get_global_state()
+    assert state["cuda"] == []
+    set_global_state(state)

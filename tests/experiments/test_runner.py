@@ -50,6 +50,23 @@ def refuse(*_: Any, **__: Any) -> None:
     raise AssertionError("a finished run is not trained again")
 
 
+def test_of_two_unfinished_runs_the_newer_one_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (cell,) = Experiment("one", "", ENV_ID, 1200, (Variant("htr-ser", "tiny", SMALL),), 1).cells()
+    runs = [cell.run_folder(tmp_path) / cell.method / f"{ENV_ID}_{number}" for number in (9, 10)]
+    for run in runs:
+        write_checkpoint(run / "checkpoints" / "400_steps", {})
+    given: list[list[str]] = []
+
+    def stop(arguments: list[str]) -> None:
+        given.append(arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(train, "main", stop)
+    with pytest.raises(KeyboardInterrupt):
+        run_cell(cell, tmp_path)
+    assert given == [["--resume", str(runs[1])]]
+
+
 def test_a_killed_run_goes_on_and_a_finished_one_is_tested(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     variant = Variant("htr-ser", "tiny", SMALL, {"n_test_tasks": 10})
     experiment = Experiment("one", "", ENV_ID, 1200, (variant,), 1, 480, by(("belief", "prior"), {}, {"goal_distance": 0.3}))
