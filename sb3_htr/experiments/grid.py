@@ -167,13 +167,14 @@ def settings_of(file: str, env_id: str = "default") -> KwArgs:
     return {key: value for key, value in block.items() if key not in ("policy", "method", "n_timesteps")}
 
 
-def under_prior(env_id: str = "default") -> tuple[Variant, ...]:
+def under_prior(env_id: str = "default", end: str = "-prior") -> tuple[Variant, ...]:
     """
     :param env_id: as for :func:`settings_of`
-    :return: HTR, and the dense proxy, under PEARL's own protocol with the settings made for it
+    :param end: of the methods' names: whether `prior` explores in rollouts, too
+    :return: HTR, and the dense proxy, with the settings that are made for PEARL's own protocol
     """
     settings = settings_of("pearl_prior.yml", env_id)
-    return tuple(Variant(method, settings=settings) for method in ("htr-ser-prior", "pearl-dense-prior"))
+    return tuple(Variant(method + end, settings=settings) for method in ("htr-ser", "pearl-dense"))
 
 
 # PEARL's methods on robots; the budgets of the two others are those of their YAML files
@@ -221,6 +222,15 @@ ALL = (
         under_prior(WHEELED),
         eval_freq=100_000,
         evaluations=UNDER_PRIOR,
+    ),
+    Experiment(
+        "ant_prior",
+        "PEARL's own protocol at meta-test, on an ant: HTR, and the dense proxy reward, with settings made for it.",
+        ANT,
+        300_000,
+        under_prior(ANT, end=""),
+        eval_freq=100_000,
+        evaluations=by(("prior", "belief")),
     ),
     Experiment(
         "learned_prior",
