@@ -10,16 +10,21 @@ from sb3_htr.experiments.protocol import MIN_RUNS
 
 RESULTS = Path(__file__).parents[1] / "results"
 DOCUMENTS = (RESULTS.parent / "README.md", RESULTS.parent / "docs" / "results.md", RESULTS.parent / "docs" / "performance.md")
-# Methods in the table of README.md, by their experiments; explorers with what is shown of them
-HEADLINE = {
-    "point_robot": ("htr-ser", "pearl-dense", "pearl-sparse"),
-    "prior": ("htr-ser-prior", "pearl-dense-prior"),
-    "wheeled": ("htr-ser", "pearl-dense", "pearl-sparse"),
-    "wheeled_prior": ("htr-ser-prior", "pearl-dense-prior"),
-    "ant": ("htr-ser", "pearl-dense"),
-    "fetch_reach": ("htr-ser", "pearl-sparse"),
-    "fetch_push": ("htr-ser", "pearl-sparse"),
-    "point_maze": ("htr-ser",),
+# The tables of README.md: methods by their experiments; explorers with what is shown of them
+HEADLINES: dict[str, dict[str, tuple[str, ...]]] = {
+    "headline": {
+        "point_robot": ("htr-ser", "pearl-dense", "pearl-sparse"),
+        "wheeled": ("htr-ser", "pearl-dense", "pearl-sparse"),
+        "ant": ("htr-ser", "pearl-dense"),
+        "fetch_reach": ("htr-ser", "pearl-sparse"),
+        "fetch_push": ("htr-ser", "pearl-sparse"),
+        "point_maze": ("htr-ser",),
+    },
+    "headline:prior": {
+        "prior": ("htr-ser-prior", "pearl-dense-prior"),
+        "wheeled_prior": ("htr-ser-prior", "pearl-dense-prior"),
+        "ant_prior": ("htr-ser", "pearl-dense"),
+    },
 }
 EXPLORERS = {
     "belief": {"last_episode_return": "return", "success_rate": "tasks solved", "episodes_to_first_success": "first success"},
@@ -109,16 +114,17 @@ def _place(row: dict[str, Any]) -> str:
     return ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in row.get("tested_on", {}).items())
 
 
-def headline(summaries: dict[str, dict[str, Any]]) -> str:
+def headline(summaries: dict[str, dict[str, Any]], methods_of: dict[str, tuple[str, ...]]) -> str:
     """
-    :param summaries: contents of ``summary.json`` by their names, those of ``HEADLINE`` among them where they are there
+    :param summaries: contents of ``summary.json`` by their names
+    :param methods_of: what is shown of them, where they are there
     :return: Markdown table, one line per env and method
     """
     shown = [(explorer, metric) for explorer, metrics in EXPLORERS.items() for metric in metrics]
     heads = [f"`{explorer}`: {EXPLORERS[explorer][metric]}" for explorer, metric in shown]
     lines = [["env", "env steps", "runs", "method", *heads]]
     lines.append(["---"] * len(lines[0]))
-    for name, methods in HEADLINE.items():
+    for name, methods in methods_of.items():
         scores: dict[tuple[str, ...], dict[tuple[str, str], str]] = {}
         for row in summaries.get(name, {"rows": []})["rows"]:
             if row["variant"] in methods and not row.get("tested_on") and (row["explorer"], row["metric"]) in shown:
@@ -171,7 +177,8 @@ def tables() -> dict[str, str]:
     """
     summaries = [json.loads(path.read_text()) for path in sorted(Path(RESULTS).glob("*/summary.json"))]
     own = {f"results:{summary['name']}": table(summary) for summary in summaries}
-    return {**own, "headline": headline({summary["name"]: summary for summary in summaries})}
+    by_name = {summary["name"]: summary for summary in summaries}
+    return {**own, **{name: headline(by_name, methods_of) for name, methods_of in HEADLINES.items()}}
 
 
 def main() -> None:

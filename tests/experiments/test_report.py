@@ -113,12 +113,13 @@ def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monk
         assert f"5 runs of {cells[0].variant}; 1 run of {cells[1].variant}" in few and few.count("fewer than the 5") == 1
     assert "fewer than the 5" in tables.table({**summary, "rows": [{**summary["rows"][0], "n_seeds": n} for n in (1, 5)]})
     assert "commit abc, evaluated by def, " in tables.table({**summary, "evaluation_commit": "def"})
-    headline = tables.headline({name: summary}).splitlines()[2:]
-    shown = [cell for cell in variants.values() if cell.variant in tables.HEADLINE.get(name, ())]
-    assert len(headline) == len(shown)
-    for line, cell in zip(headline, shown, strict=True):
-        explorers = {e.explorer for e in cell.evaluations if not e.tested_on} & {*tables.EXPLORERS}
-        assert f"| {cell.n_timesteps:,} | 3 | {cell.variant} | " in line and line.count("| 2.0 [1.") == len(explorers)
+    for methods_of in tables.HEADLINES.values():
+        headline = tables.headline({name: summary}, methods_of).splitlines()[2:]
+        shown = [cell for cell in variants.values() if cell.variant in methods_of.get(name, ())]
+        assert len(headline) == len(shown)
+        for line, cell in zip(headline, shown, strict=True):
+            explorers = {e.explorer for e in cell.evaluations if not e.tested_on} & {*tables.EXPLORERS}
+            assert f"| {cell.n_timesteps:,} | 3 | {cell.variant} | " in line and line.count("| 2.0 [1.") == len(explorers)
 
 
 def test_agents_without_explorers_are_in_the_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
