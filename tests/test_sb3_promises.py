@@ -22,6 +22,8 @@ from helpers import ENV_ID, ROLLOUT, MakePEARL
 from helpers import parameters as all_parameters
 from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.adaptation import MetaEvalCallback
+from sb3_htr.common.resume import CheckpointCallback as Checkpointing
+from sb3_htr.common.resume import load_latest
 from sb3_htr.common.vec_env import make_task_vec_env
 
 
@@ -120,14 +122,14 @@ def test_a_callback_that_an_evaluation_calls_goes_on_where_it_was(tiny_pearl: Ma
     """A training that learns nothing is stopped at the same step, interrupted or not."""
     steps = []
     for parts in ([40 * ROLLOUT], [6 * ROLLOUT, 40 * ROLLOUT]):
-        model, state = tiny_pearl(learning_rate=0.0), None
-        for total in parts:
-            patience = StopTrainingOnNoModelImprovement(max_no_improvement_evals=6)
+        run = tmp_path / str(len(parts))
+        for i, total in enumerate(parts):
+            model, patience = tiny_pearl(learning_rate=0.0), StopTrainingOnNoModelImprovement(max_no_improvement_evals=6)
             evaluation = MetaEvalCallback(ENV_ID, eval_freq=60, n_eval_episodes=1, callback_after_eval=patience, verbose=0)
-            if state is not None:
-                evaluation.load_state_dict(state)
-            model.learn(total - model.num_timesteps, evaluation, reset_num_timesteps=False)
-            state = evaluation.state_dict()
+            checkpointing = Checkpointing(1, str(run), companions=[evaluation])
+            if i > 0:
+                checkpointing.restore(model, load_latest(run)[1])
+            model.learn(total - model.num_timesteps, [checkpointing, evaluation], reset_num_timesteps=False)
         steps.append(model.num_timesteps)
     assert steps[0] == steps[1] < 40 * ROLLOUT
 

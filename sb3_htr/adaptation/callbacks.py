@@ -8,14 +8,13 @@ from typing import Any, cast
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.evaluation import MetaLearner, first_success, record_adaptation, task_set
 from sb3_htr.adaptation.explorers import to_explorer
 from sb3_htr.common.atomic import WRITE_ERRORS, atomic_path, reason
 from sb3_htr.common.checks import get_task_family
-from sb3_htr.common.resume import numbers_of, restore_numbers
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
 
@@ -70,7 +69,6 @@ class MetaEvalCallback(EvalCallback):
             "returns": [th.from_numpy(returns) for returns in self.returns],
             "successes": [th.from_numpy(successes) for successes in self.successes],
             "best_mean_reward": float(self.best_mean_reward),
-            "children": [numbers_of(child) for child in self._children()],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -81,13 +79,6 @@ class MetaEvalCallback(EvalCallback):
         self.returns = [returns.numpy() for returns in state["returns"]]
         self.successes = [successes.numpy() for successes in state["successes"]]
         self.best_mean_reward = state["best_mean_reward"]
-        # Older checkpoints have none
-        for child, numbers in zip(self._children(), state.get("children", []), strict=False):
-            restore_numbers(child, numbers)
-
-    def _children(self) -> list[BaseCallback]:
-        """Callbacks that are called after an evaluation, and on a new best one."""
-        return [child for child in (self.callback, self.callback_on_new_best) if child is not None]
 
     def _init_callback(self) -> None:
         if _share_an_env(self.eval_env, self.model.get_env()):

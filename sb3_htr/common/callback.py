@@ -23,6 +23,7 @@ def parts_of(callback: BaseCallback) -> Iterator[BaseCallback]:
     :return: itself and all of these
     """
     yield callback
-    for part in (*getattr(callback, "callbacks", ()), getattr(callback, "callback", None)):
+    others = (getattr(callback, name, None) for name in ("callback", "callback_on_new_best"))
+    for part in (*getattr(callback, "callbacks", ()), *others):
         if isinstance(part, BaseCallback):
             yield from parts_of(part)

@@ -15,6 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import TensorBoardOutputFormat
 
 from sb3_htr.common.atomic import WRITE_ERRORS, atomic_path, reason
+from sb3_htr.common.callback import parts_of
 from sb3_htr.common.checkpoint import DamagedCheckpoint, read_checkpoint, write_checkpoint
 from sb3_htr.common.settings import check_numbers
 
@@ -55,7 +56,8 @@ def numbers_of(callback: BaseCallback) -> dict[str, Any]:
     :param callback: that has no state of its own to tell, as SB3's have none
     :return: its numbers, counts among them
     """
-    return {name: value for name, value in vars(callback).items() if type(value) in NUMBERS}
+    plain = {name: _plain(value) for name, value in vars(callback).items()}
+    return {name: value for name, value in plain.items() if type(value) in NUMBERS}
 
 
 def restore_numbers(callback: BaseCallback, numbers: dict[str, Any]) -> None:
@@ -63,8 +65,13 @@ def restore_numbers(callback: BaseCallback, numbers: dict[str, Any]) -> None:
     :param callback: which has these numbers
     :param numbers: of :func:`numbers_of`; what else a file may name stays as it is
     """
-    known = numbers_of(callback)
+    # A default may be an attribute of the class
+    known = {name for name in numbers if type(_plain(getattr(callback, name, None))) in NUMBERS}
     vars(callback).update({name: value for name, value in numbers.items() if name in known and type(value) in NUMBERS})
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def n_steps_done(run: Path) -> int:
@@ -127,7 +134,8 @@ class CheckpointCallback(BaseCallback):
     :param save_freq: smallest number of calls (steps of the VecEnv) between two checkpoints
     :param save_path: folder of the run
     :param keep: number of checkpoints to keep, the latest ones
-    :param companions: callbacks of the same training; the state of those that have one is saved too
+    :param companions: callbacks of the same training. Saved too, of them and of those that they call, is the state, or, of one
+        that has no ``state_dict``, each attribute that is a number
     :param name_prefix: for SB3's signature, not used
     :param verbose: 1 says where checkpoints are written
     :raises ValueError: if none would be kept
@@ -161,11 +169,11 @@ class CheckpointCallback(BaseCallback):
         :param state: of :func:`load_latest`
         :raises ValueError: for other callbacks than it was begun with
         """
-        callbacks = (self, *self.companions)
+        callbacks = self._callbacks()
         if len(callbacks) != len(state["callbacks"]):
             raise ValueError(
-                f"The training was begun with {len(state['callbacks']) - 1} companions of its CheckpointCallback, and goes on "
-                f"with {len(self.companions)}: give it the same callbacks, in the same order."
+                f"The training was begun with {len(state['callbacks']) - 1} callbacks beside its CheckpointCallback, those "
+                f"within others counted, and goes on with {len(callbacks) - 1}: give it the same ones, in the same order."
             )
         model.load_state_dict(state["model"])
         for callback, remembered in zip(callbacks, state["callbacks"], strict=True):
@@ -177,6 +185,9 @@ class CheckpointCallback(BaseCallback):
         self._last_calls = self.n_calls
         # Setting up the training makes a logger
         self._pending = state
+
+    def _callbacks(self) -> list[BaseCallback]:
+        return [self, *(part for companion in self.companions for part in parts_of(companion))]
 
     def stop(self) -> None:
         """Save a checkpoint before the next rollout, and end the training there."""
@@ -289,7 +300,7 @@ class CheckpointCallback(BaseCallback):
 
     def _callback_states(self) -> list[dict[str, Any]]:
         states = []
-        for callback in (self, *self.companions):
+        for callback in self._callbacks():
             state = None if callback is self else numbers_of(callback)
             if isinstance(callback, HasState):
                 state = callback.state_dict()

@@ -8,13 +8,20 @@ import gymnasium as gym
 import matplotlib.figure
 import numpy as np
 import pytest
-from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CallbackList,
+    EveryNTimesteps,
+    StopTrainingOnMaxEpisodes,
+    StopTrainingOnNoModelImprovement,
+)
 from stable_baselines3.common.logger import Figure, HParam
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL
-from sb3_htr.common.resume import CheckpointCallback, checkpoints, load_latest, restore_numbers
+from sb3_htr.adaptation.callbacks import MetaEvalCallback
+from sb3_htr.common.resume import CheckpointCallback, checkpoints, load_latest, numbers_of, restore_numbers
 from sb3_htr.common.vec_env import make_task_vec_env
 
 
@@ -106,6 +113,44 @@ def test_counts_of_callbacks_of_others_go_on(tiny_pearl: MakePEARL, tmp_path: Pa
     # A file of a stranger changes numbers, and nothing else
     restore_numbers(stop, {"n_episodes": 3, "max_episodes": "many", "_on_step": 1, "model": 2})
     assert stop.n_episodes == 3 and stop.max_episodes == 11 and "_on_step" not in vars(stop) and stop.model is model
+
+
+class Highest(BaseCallback):
+    """Its number is one of numpy."""
+
+    best: float = -np.inf
+
+    def _on_step(self) -> bool:
+        self.best = np.max([self.best, *(self.locals["rewards"] if "rewards" in self.locals else [])])
+        return True
+
+
+def nested() -> tuple[list[BaseCallback], BaseCallback]:
+    """Callbacks that call others, and these alone."""
+    inner = [StopTrainingOnNoModelImprovement(max_no_improvement_evals=60), Highest(), Highest(), Highest()]
+    outer = [
+        MetaEvalCallback(
+            ENV_ID,
+            eval_freq=60,
+            n_eval_episodes=1,
+            verbose=0,
+            callback_after_eval=CallbackList([inner[0]]),
+            callback_on_new_best=inner[1],
+        ),
+        EveryNTimesteps(100, inner[2]),
+        CallbackList([inner[3]]),
+    ]
+    return inner, CallbackList(outer)
+
+
+def test_numbers_of_callbacks_within_others_go_on(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    (inner, outer), model = nested(), tiny_pearl(learning_rate=0.0)
+    model.learn(3 * ROLLOUT, [outer, CheckpointCallback(1, str(tmp_path), companions=[outer])])
+    (again, outer), model = nested(), tiny_pearl(learning_rate=0.0)
+    CheckpointCallback(1, str(tmp_path), companions=[outer]).restore(model, load_latest(tmp_path)[1])
+    assert [numbers_of(callback) for callback in again] == [numbers_of(callback) for callback in inner]
+    assert all(callback.n_calls > 0 for callback in again)
+    assert again[3].best == inner[3].best > -np.inf  # type: ignore[attr-defined]
 
 
 def test_some_checkpoints_are_kept() -> None:
