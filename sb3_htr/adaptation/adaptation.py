@@ -10,7 +10,7 @@ from sb3_htr.adaptation.knowledge import LatentKnowledge
 from sb3_htr.adaptation.policy import ContextualPolicy
 from sb3_htr.common.task_reward import task_reward
 from sb3_htr.common.type_aliases import Context
-from sb3_htr.htr.groups import evenly_spread
+from sb3_htr.htr.groups import evenly_spread, positions
 
 # Of observations, actions and rewards: networks see float32, of which larger ones have no squares
 LARGEST = 1e18
@@ -25,7 +25,7 @@ class Step(NamedTuple):
     :param rewards: (n_envs,)
     :param next_observations: (n_envs, obs_dim), the last one of its episode where one ended
     :param dones: (n_envs,) bool, where an episode ended
-    :param infos: one dict per env, which only meta-training needs
+    :param infos: one dict per env. A loop of one's own needs none: they are for meta-training, and for those who watch
     """
 
     observations: np.ndarray
@@ -136,8 +136,8 @@ class Adaptation:
             self._check("actions", step.actions, self.policy.action_dim)
             self._check("dones", step.dones)
             self._check_scaled(step.actions)
-        self._remember(step.observations, step.actions, step.rewards)
         self.task_reward = self._told(step) if self.is_training else self._learned(step)
+        self._remember(step.observations, step.actions, step.rewards, self.task_reward)
         self.episode_return += self.task_reward
         ended = np.flatnonzero(step.dones)
         self.n_episodes[ended] += 1
@@ -204,9 +204,11 @@ class Adaptation:
         """
         if len(envs) == 0:
             return
-        steps, lengths = evenly_spread(self._n_steps[envs], self.context_size)
+        n_steps = self._n_steps[envs]
+        *columns, task_reward = self._running
+        steps, lengths = evenly_spread(n_steps, self.context_size, task_reward[np.repeat(envs, n_steps), positions(n_steps)])
         at, device = (np.repeat(envs, lengths), steps), self.policy.device
-        context = Context(*(th.as_tensor(array, device=device) for array in (*(v[at] for v in self._running), lengths)))
+        context = Context(*(th.as_tensor(array, device=device) for array in (*(column[at] for column in columns), lengths)))
         before = self._state[envs] if keep else self.policy.encoder.empty(len(envs))
         with th.no_grad():
             self._state[envs] = self.policy.extend_posterior(before, context)

@@ -136,11 +136,13 @@ class TaskBank:
         success = self.task_family.is_success(traj, self.tasks) & (np.arange(episodes.shape[1]) < length[:, None])[:, None]
         reward = self.task_family.compute_reward(traj, self.tasks) - traj.task_free_reward
         # 0 or clearly more: the reward without the task-free part is a difference of float32
-        returns = np.where(success, reward, 0.0).sum(axis=-1, dtype=np.float32)
+        gains = np.where(success, reward, 0.0)
+        returns = gains.sum(axis=-1, dtype=np.float32)
         best = returns.argmax(axis=0)
         better = np.flatnonzero(returns.max(axis=0) > self.best_return + ROUNDING)
         self.best_return[better] = returns[best[better], better]
-        steps, taken = evenly_spread(length[best[better]], self.context_size)
+        of_best = gains[best[better], better][np.arange(episodes.shape[1]) < length[best[better], None]]
+        steps, taken = evenly_spread(length[best[better]], self.context_size, of_best)
         self.length[better] = taken
         kept = np.arange(self.context_size) < taken[:, None]
         within = self.episodes[better]

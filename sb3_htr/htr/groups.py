@@ -29,13 +29,26 @@ def ascending(values: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     return np.sort(values + group) - group
 
 
-def evenly_spread(lengths: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+def evenly_spread(lengths: np.ndarray, size: int, rewards: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """
     What of an episode becomes its context: steps at equal distances, the last one among them, which may be all that counts.
 
-    :param lengths: (n,) int, number of steps of each episode
+    :param lengths: (n,) int, number of steps of each episode, at least 1
     :param size: number of steps to take of each, at most
+    :param rewards: (sum of the lengths,), those of the first episode first, 0 where a step earns nothing beside what is
+        task-free. Where none of the steps taken earns something and others do, the one that earns most takes the place of
+        the step next to it: a goal that was passed between two of them would be no evidence
     :return: the steps taken, those of the first episode first, and (n,) int, how many are of each
     """
     taken = np.minimum(lengths, size)
-    return (positions(taken) + 1) * np.repeat(lengths, taken) // np.repeat(taken, taken) - 1, taken
+    steps = (positions(taken) + 1) * np.repeat(lengths, taken) // np.repeat(taken, taken) - 1
+    if rewards is None or len(lengths) == 0:
+        return steps, taken
+    first, first_taken = first_rows(lengths), first_rows(taken)
+    seen = np.maximum.reduceat(rewards[steps + np.repeat(first, taken)], first_taken) > 0
+    # There are few
+    for i in np.flatnonzero(~seen & (np.maximum.reduceat(rewards, first) > 0)):
+        best = rewards[first[i] : first[i] + lengths[i]].argmax()
+        own = steps[first_taken[i] : first_taken[i] + taken[i]]
+        own[np.abs(own - best).argmin()] = best
+    return steps, taken

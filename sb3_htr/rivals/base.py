@@ -54,7 +54,8 @@ class RivalAdaptation(ABC):
         """
         :param step: what each env did
         """
-        self._found |= [bool(info.get("is_success", False)) for info in step.infos]
+        if step.infos:
+            self._found |= [bool(info.get("is_success", False)) for info in step.infos]
 
     def exploring(self) -> np.ndarray:
         """

@@ -115,6 +115,19 @@ def test_a_long_episode_narrows_the_posterior_as_much_as_a_context_of_training(t
     np.testing.assert_allclose(adaptation.posterior()[1], variance.sqrt(), rtol=1e-5)
 
 
+def test_a_goal_that_was_passed_between_two_steps_of_a_context_is_in_it(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    adaptation = begin(model, "aggregate", context_size=5)
+    rows = np.random.default_rng(0).uniform(-1, 1, size=(50, 1, 4)).astype(np.float32)
+    for i, row in enumerate(rows):
+        adaptation.observe(step(row[:, :2], [5.0 * (i in (22, 23)) + (i == 23)], i == 49, actions=row[:, 2:]))
+    kept = [9, 23, 29, 39, 49]
+    obs, actions = (th.tensor(rows[kept, 0, columns]) for columns in (slice(0, 2), slice(2, 4)))
+    with th.no_grad():
+        mean, _ = model.policy.infer(Context(obs, actions, th.tensor([0.0, 6, 0, 0, 0]), th.tensor([5])))
+    np.testing.assert_allclose(adaptation.posterior()[0], mean, rtol=1e-4, atol=1e-6)
+
+
 @pytest.mark.parametrize("max_setbacks", [2, 4])
 def test_it_settles_on_the_best_episode_after_setbacks(tiny_pearl: MakePEARL, max_setbacks: int) -> None:
     model = tiny_pearl()

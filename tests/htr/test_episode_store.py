@@ -59,3 +59,16 @@ def test_contexts_are_spread_over_their_episodes(lengths: list[int], size: int) 
         # Equally far from each other and from the start, up to rounding; the last step may be all that counts
         assert np.ptp(np.diff([-1, *episode])) <= 1 and episode[-1] == length - 1
         assert length > size or (episode == np.arange(length)).all()
+
+
+@given(st.lists(st.lists(st.sampled_from([0.0, 0.0, 0.0, 1.0, 2.0]), min_size=1, max_size=60), max_size=6), st.integers(1, 12))
+def test_a_context_has_a_reward_if_its_episode_has_one(rewards: list[list[float]], size: int) -> None:
+    lengths = np.array([len(own) for own in rewards], dtype=int)
+    steps, taken = evenly_spread(lengths, size, np.array([reward for own in rewards for reward in own]))
+    usual, n_usual = evenly_spread(lengths, size)
+    assert taken.tolist() == n_usual.tolist()
+    for own, i, usual_i in zip(rewards, np.split(steps, np.cumsum(taken)[:-1]), np.split(usual, np.cumsum(taken)[:-1]), strict=False):
+        assert max(np.array(own)[i]) > 0 or not any(own)
+        assert (np.diff(i) > 0).all() and 0 <= i[0] and i[-1] < len(own)
+        # One step at most is another one, and only where it must
+        assert (i != usual_i).sum() == (any(own) and not np.array(own)[usual_i].any())
