@@ -125,7 +125,12 @@ def test_an_unknown_id_is_gymnasiums_business(tiny_pearl: MakePEARL) -> None:
         ({"policy_kwargs": {"activation_fn": "ReLU"}}, r"activation_fn is 'ReLU', expected a class derived from torch\.nn"),
         ({"policy_kwargs": {"optimizer_class": "Adam"}}, r"optimizer_class is 'Adam', expected a class derived from torch\."),
         ({"policy_kwargs": {"normalize_observations": "no"}}, "normalize_observations is 'no', expected True or False"),
+        ({"policy_kwargs": {"use_sde": True}}, "policy_kwargs has no setting 'use_sde'"),
         ({"ent_coef": -0.1}, "ent_coef is -0.1, expected a number of at least 0"),
+        *(
+            ({"ent_coef": text}, f"ent_coef is the text '{text}', expected a number")
+            for text in ("5e-2", "-0.5", "foo", "auto_0")
+        ),
         ({"replay_buffer_kwargs": {"relabel_probability": -1}}, "relabel_probability is -1"),
         ({"buffer_size": 10}, "buffer_size is 10, too small"),
         ({"policy": "CnnPolicy"}, "CnnPolicy unknown"),

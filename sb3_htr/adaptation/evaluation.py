@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.loop import Adapting, adaptation_steps
 from sb3_htr.common.checks import check_is_env, get_task_family
-from sb3_htr.common.random_state import MAX_SEED, seeded_actions
+from sb3_htr.common.random_state import MAX_SEED, kept_env_states, seeded_actions
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.type_aliases import TaskFamily
 from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env, reset_to_tasks
@@ -184,15 +184,17 @@ def record_adaptation(
     tasks = task_set(get_task_family(env), tasks)
     seed = int(seed)  # torch takes no numbers of numpy
     generator = th.Generator().manual_seed(seed)
-    env.seed(seed)
     records = []
-    for first in range(0, len(tasks), env.num_envs):
-        # Envs without a task of their own repeat the last one
-        index = np.minimum(np.arange(first, first + env.num_envs), len(tasks) - 1)
-        obs = reset_to_tasks(env, tasks[index])
-        adaptation = model.start_adaptation(env.num_envs, explorer, generator)
-        record = run_adaptation(model.policy, env, adaptation, obs, n_episodes, deterministic, (seed, first))
-        records.append([values[: len(tasks) - first] for values in record])
+    # It may be the env of training
+    with kept_env_states(env):
+        env.seed(seed)
+        for first in range(0, len(tasks), env.num_envs):
+            # Envs without a task of their own repeat the last one
+            index = np.minimum(np.arange(first, first + env.num_envs), len(tasks) - 1)
+            obs = reset_to_tasks(env, tasks[index])
+            adaptation = model.start_adaptation(env.num_envs, explorer, generator)
+            record = run_adaptation(model.policy, env, adaptation, obs, n_episodes, deterministic, (seed, first))
+            records.append([values[: len(tasks) - first] for values in record])
     length = max(achieved.shape[2] for _, _, achieved in records)
     for record_ in records:
         padding = ((0, 0), (0, 0), (0, length - record_[2].shape[2]), (0, 0))

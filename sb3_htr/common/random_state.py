@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.common.settings import check_numbers
 
@@ -52,6 +53,39 @@ def set_generator_state(generator: np.random.Generator, state: str) -> None:
     :param state: of :func:`get_generator_state`
     """
     generator.bit_generator.state = json.loads(state)
+
+
+def get_env_states(env: VecEnv) -> list[str]:
+    """
+    :param env: of gymnasium's envs
+    :return: state of the generator of each
+    """
+    return [get_generator_state(generator) for generator in env.get_attr("np_random")]
+
+
+def set_env_states(env: VecEnv, states: list[str]) -> None:
+    """
+    :param env: of as many envs
+    :param states: of :func:`get_env_states`
+    """
+    for i, (generator, state) in enumerate(zip(env.get_attr("np_random"), states, strict=True)):
+        set_generator_state(generator, state)
+        env.set_attr("np_random", generator, indices=i)
+
+
+@contextmanager
+def kept_env_states(env: VecEnv) -> Iterator[None]:
+    """
+    The generators of envs are afterwards as they were before, whatever is seeded and drawn within.
+
+    :param env: those of envs that have no generator of gymnasium's are left alone
+    """
+    states = get_env_states(env) if env.has_attr("np_random") else None
+    try:
+        yield
+    finally:
+        if states is not None:
+            set_env_states(env, states)
 
 
 def get_global_state() -> dict[str, Any]:

@@ -9,7 +9,14 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_htr.common.random_state import get_generator_state, get_global_state, set_generator_state, set_global_state
+from sb3_htr.common.random_state import (
+    get_env_states,
+    get_generator_state,
+    get_global_state,
+    set_env_states,
+    set_generator_state,
+    set_global_state,
+)
 
 
 class Resumable(BaseAlgorithm):
@@ -48,8 +55,8 @@ class Resumable(BaseAlgorithm):
         self.set_parameters(deepcopy(state["parameters"]), exact_match=True, device=self.device)
         if getattr(self, "log_ent_coef", None) is not None:
             self.log_ent_coef.data.copy_(state["log_ent_coef"])  # type: ignore[attr-defined]
-        for name, value in state["counters"].items():
-            setattr(self, name, value)
+        for name in self.COUNTERS:
+            setattr(self, name, state["counters"][name])
         infos = [{key: _number(value) for key, value in info.items()} for info in state["episode_infos"]]
         self.ep_info_buffer = deque(infos, maxlen=self._stats_window_size)
         successes = [_number(success) for success in state["episode_successes"]]
@@ -58,10 +65,9 @@ class Resumable(BaseAlgorithm):
 
     def _get_random_state(self) -> dict[str, Any]:
         assert self.env is not None
-        envs = [get_generator_state(generator) for generator in self.env.get_attr("np_random")]
         # Random actions at the beginning are SB3's
         actions = get_generator_state(self.action_space.np_random)
-        return {"global": get_global_state(), "envs": envs, "actions": actions}
+        return {"global": get_global_state(), "envs": get_env_states(self.env), "actions": actions}
 
     def _set_random_state(self, state: dict[str, Any]) -> None:
         assert self.env is not None
@@ -71,9 +77,7 @@ class Resumable(BaseAlgorithm):
             )
         set_global_state(state["global"])
         set_generator_state(self.action_space.np_random, state["actions"])
-        for i, (generator, saved) in enumerate(zip(self.env.get_attr("np_random"), state["envs"], strict=True)):
-            set_generator_state(generator, saved)
-            self.env.set_attr("np_random", generator, indices=i)
+        set_env_states(self.env, state["envs"])
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         result = super()._setup_learn(*args, **kwargs)

@@ -91,16 +91,21 @@ class BatchedTaskVecEnv(VecEnv):
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         if attr_name in PER_ENV:
             raise ValueError(f"A batch takes no {attr_name}: call set_options, with {attr_name!r} for each env, and reset.")
-        # For all, as they share what they are made of
+        # For all, as they share what they are made of, a generator too
+        if attr_name != "np_random":
+            self._check_is_for_all(indices)
         setattr(self.vector_env, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
+        self._check_is_for_all(indices)
+        return [getattr(self.vector_env, method_name)(*args, **kwargs)] * self.num_envs
+
+    def _check_is_for_all(self, indices: VecEnvIndices) -> None:
         if len(list(self._get_indices(indices))) < self.num_envs:
             raise ValueError(
                 "One call serves the whole batch of envs, not some of them: leave indices out, or make the envs one by one, "
                 "with vec_env_class=DummyVecEnv."
             )
-        return [getattr(self.vector_env, method_name)(*args, **kwargs)] * self.num_envs
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         return [False] * len(list(self._get_indices(indices)))

@@ -117,6 +117,9 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         if env is not None:
             env = self._wrap_env(env)
             checks.check_spaces(env)
+        policy_class = self.policy_aliases.get(policy) if isinstance(policy, str) else policy
+        if policy_class is not None:  # else SB3 says so
+            check_keywords("policy_kwargs", policy_kwargs or {}, policy_class)
         super().__init__(
             policy=policy,
             env=env,  # type: ignore[arg-type]
@@ -129,13 +132,14 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         )
         # SAC adds an argument for state-dependent exploration, which is not for us: z explores
         self.policy_kwargs.pop("use_sde")
-        check_keywords("policy_kwargs", self.policy_kwargs, self.policy_class)
         self.context_size: int = context_size  # type: ignore[assignment]
         self.n_steps: int = n_steps  # type: ignore[assignment]
         self.n_tasks_per_rollout = n_tasks_per_rollout
         self.n_episodes_per_task: int = n_episodes_per_task  # type: ignore[assignment]
-        #: Of training; None if the model has had no env yet
+        #: Of training, which settings follow from: time limit and tasks of a rollout, whose envs are all stepped. None if the
+        #: model has had no env yet
         self.max_episode_steps: int | None = None
+        self.n_rollout_tasks: int | None = None
         self.task_bank: TaskBank | None = None
         #: Called after each update
         self.update_listeners: list[Callable[[], None]] = []
@@ -185,6 +189,13 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         given = {name: getattr(self, name) for name in BY_HORIZON}
         vars(self).update(complete(given, max_episode_steps, n_tasks))
         if self.env is not None:
+            before = self.n_rollout_tasks or n_tasks
+            if max(n_tasks, before) > 1.5 * min(n_tasks, before):  # less may be a batch that is rounded up
+                warnings.warn(
+                    f"A rollout is of {n_tasks} tasks, and what follows from that is still of {before}: to train in "
+                    "so many envs, make a new model, or give load what it should have (gradient_steps, learning_starts)."
+                )
+            self.n_rollout_tasks = n_tasks
             rollout = n_tasks * self.n_episodes_per_task * max_episode_steps
             if rollout > MAX_STEPS_PER_UPDATE * self.gradient_steps:
                 warnings.warn(

@@ -1,5 +1,6 @@
 """PEARL: encoder, critics and actor, and how they learn."""
 
+import re
 from typing import Any, ClassVar
 
 import torch as th
@@ -19,6 +20,8 @@ from sb3_htr.pearl.policies import LatentCritic, MlpPolicy, PEARLPolicy
 
 # By measurement on validation tasks of the Point Robot
 LEARNING_RATE = LinearSchedule(start=1e-3, end=0.0, end_fraction=1.0)
+# What SB3 reads as an entropy coefficient that is learnt, with a first value above 0
+LEARNT_ENT_COEF = r"auto(_(?=[^e]*[1-9])\d+(\.\d+)?(e-?\d)?)?"
 # Transitions of a meta-batch that the reward model learns from, each under all its tasks
 N_LABELLED = 256
 
@@ -176,10 +179,14 @@ class PEARL(OffPolicyMetaAlgorithm):
             kl_coef=(self.kl_coef, 0.0),
             final_kl_coef=(self.kl_coef if self.final_kl_coef is None else self.final_kl_coef, 0.0),
             reward_coef=(self.reward_coef, 0.0),
-            # SAC reads words
             ent_coef=(0.0 if isinstance(self.ent_coef, str) else self.ent_coef, 0.0),
             tau=(self.tau, 0.0, 1.0),
         )
+        if isinstance(self.ent_coef, str) and not re.fullmatch(LEARNT_ENT_COEF, self.ent_coef):
+            raise ValueError(
+                f'ent_coef is the text {self.ent_coef!r}, expected a number, or "auto" or "auto_0.1", by which one is learnt. '
+                "In YAML, 1.0e-3 is a number, and 1e-3 is not."
+            )
         if self.tau == 0:
             raise ValueError("tau is 0, with which the target critics would never learn: expected a number above 0, up to 1.")
         if self.final_kl_coef is not None and 0 in (self.kl_coef, self.final_kl_coef):

@@ -18,7 +18,7 @@ from sb3_htr.common.saving import with_suffix
 from sb3_htr.common.settings import keywords_of
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.pearl.encoder import ENCODERS
-from sb3_htr.pearl.pearl import PEARL
+from sb3_htr.pearl.pearl import LEARNT_ENT_COEF, PEARL
 from sb3_htr.pearl.policies import PEARLPolicy
 
 # How large networks may be
@@ -37,7 +37,7 @@ NUMBERS = (
     *("kl_coef", "final_kl_coef", "reward_coef"),
     *("n_tasks_per_rollout", "n_episodes_per_task", "buffer_size"),
 )
-WORDS = {"ent_coef": r"auto(_(?=.*[1-9])\d+(\.\d+)?)?", "target_entropy": "auto", "matmul_precision": "highest|high|medium"}
+WORDS = {"ent_coef": LEARNT_ENT_COEF, "target_entropy": "auto", "matmul_precision": "highest|high|medium"}
 COUNTERS = ("num_timesteps", "_n_updates")
 # Arguments of the replay buffer that are plain data
 REPLAY = ("relabel_probability", "relabeller", "rl_reward_type", "context_episodes")
@@ -92,7 +92,10 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
     for name in ("policy_kwargs", "replay_buffer_kwargs"):
         kwargs[name] = {**settings.pop(name), **(kwargs.get(name) or {})}
     _check_shapes(path, weights["policy"], env, kwargs["policy_kwargs"])
-    model = PEARL("MlpPolicy", env, device=device, **{**settings, **kwargs})
+    model = PEARL("MlpPolicy", env, device=device, _init_setup_model=False, **{**settings, **kwargs})
+    # Which settings follow from: where the env has others, that is warned of
+    vars(model).update({name: data[name] for name in ("max_episode_steps", "n_rollout_tasks") if type(data.get(name)) is int})
+    model._setup_model()
     try:
         model.policy.load_state_dict(weights["policy"])
         model.knowledge.load_state_dict(weights["knowledge"])

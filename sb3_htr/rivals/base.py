@@ -31,6 +31,16 @@ class OwnWay:
     name = "own"
 
 
+def check_explores_in_own_way(agent: object, explorer: Any) -> None:
+    """
+    :param agent: that has no explorers
+    :param explorer: what is asked for
+    :raises ValueError: if that is one
+    """
+    if explorer not in (None, OwnWay.name):
+        raise ValueError(f"{type(agent).__name__} has no explorers, but the explorer is {explorer!r}: leave it out.")
+
+
 class RivalAdaptation(ABC):
     """
     Keeps what anybody can see of an adaptation; a subclass says how to act.
@@ -148,8 +158,7 @@ class Rival(CheckedFiles, Resumable):
         :return: acts, and takes in what happens
         :raises ValueError: for an explorer
         """
-        if explorer not in (None, OwnWay.name):
-            raise ValueError(f"{type(self).__name__} has no explorers, but the explorer is {explorer!r}: leave it out.")
+        check_explores_in_own_way(self, explorer)
         return self._adaptation(n_envs, generator)
 
     def check_env(self, env: VecEnv) -> None:

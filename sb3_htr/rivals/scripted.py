@@ -9,7 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_htr.rivals.base import OwnWay, ToldAdaptation, unscaled
+from sb3_htr.rivals.base import OwnWay, ToldAdaptation, check_explores_in_own_way, unscaled
 
 # Observations (n, obs_dim) and tasks (n, task_dim) to actions (n, action_dim), scaled to [-1, 1]
 Script = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -55,7 +55,9 @@ class ScriptedAgent:
         :param explorer: None or ``"own"``: a script explores in no other way
         :param generator: source of random actions; torch's global one by default
         :return: acts by the script
+        :raises ValueError: for an explorer
         """
+        check_explores_in_own_way(self, explorer)
 
         def act(obs: np.ndarray, tasks: np.ndarray, deterministic: bool) -> np.ndarray:
             if self.script is not None:

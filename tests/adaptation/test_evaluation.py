@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from helpers import ENV_ID, PRIOR, ROLLOUT, MakePEARL
 from helpers.adaptations import know_tasks
@@ -16,6 +16,7 @@ from htr_envs import PointRobotFamily
 from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.adaptation import Belief, Prior, evaluation
 from sb3_htr.adaptation.evaluation import record_adaptation
+from sb3_htr.common.random_state import get_env_states
 from sb3_htr.common.vec_env import make_task_vec_env
 
 
@@ -215,6 +216,17 @@ def test_sampled_actions_leave_the_random_state_of_training_alone(tiny_pearl: Ma
         assert (th.get_rng_state() == before).all()
         th.randn(3)
     assert (results[0] == results[1]).all()
+
+
+@pytest.mark.parametrize("batched", [True, False])
+def test_an_evaluation_in_the_env_of_training_leaves_its_random_state_alone(tiny_pearl: MakePEARL, batched: bool) -> None:
+    """Else all runs that are evaluated by the same seed would draw the same from there on."""
+    env = make_task_vec_env(ENV_ID, 4, vec_env_class=None if batched else DummyVecEnv)
+    model = tiny_pearl(env).learn(ROLLOUT)
+    before = get_env_states(env)
+    assert len({*before}) == (1 if batched else 4)
+    evaluate_adaptation(model, env, n_episodes=1)
+    assert get_env_states(env) == before
 
 
 def test_no_two_evaluations_share_noise(tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -153,6 +153,14 @@ def test_numbers_of_callbacks_within_others_go_on(tiny_pearl: MakePEARL, tmp_pat
     assert again[3].best == inner[3].best > -np.inf  # type: ignore[attr-defined]
 
 
+def test_a_state_sets_what_goes_on_and_nothing_else(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    state = model.state_dict()
+    state["counters"] |= {"gamma": 0.0, "num_timesteps": 480}
+    model.load_state_dict(state)
+    assert model.num_timesteps == 480 and model.gamma == 0.9
+
+
 def test_some_checkpoints_are_kept() -> None:
     with pytest.raises(ValueError, match="keep is 0, expected a whole number of at least 1"):
         CheckpointCallback(1, "run", keep=0)

@@ -52,6 +52,8 @@ def test_a_batch_has_the_attributes_of_single_envs() -> None:
     assert env.has_attr("task") and len(env.get_attr("task")) == 2
     with pytest.raises(ValueError, match="One call serves the whole batch of envs, not some of them: leave indices out"):
         env.env_method("set_task", None, indices=[0])
+    with pytest.raises(ValueError, match="One call serves the whole batch of envs, not some of them: leave indices out"):
+        env.set_attr("any", 1, indices=[0])
 
 
 def test_an_observation_stays_what_it_was() -> None:

@@ -67,7 +67,9 @@ def test_a_context_has_a_reward_if_its_episode_has_one(rewards: list[list[float]
     steps, taken = evenly_spread(lengths, size, np.array([reward for own in rewards for reward in own]))
     usual, n_usual = evenly_spread(lengths, size)
     assert taken.tolist() == n_usual.tolist()
-    for own, i, usual_i in zip(rewards, np.split(steps, np.cumsum(taken)[:-1]), np.split(usual, np.cumsum(taken)[:-1]), strict=False):
+    for own, i, usual_i in zip(
+        rewards, np.split(steps, np.cumsum(taken)[:-1]), np.split(usual, np.cumsum(taken)[:-1]), strict=False
+    ):
         assert max(np.array(own)[i]) > 0 or not any(own)
         assert (np.diff(i) > 0).all() and 0 <= i[0] and i[-1] < len(own)
         # One step at most is another one, and only where it must

@@ -1,5 +1,6 @@
 """Settings that follow from the time limit."""
 
+import warnings
 from typing import Any
 
 import gymnasium as gym
@@ -7,7 +8,9 @@ import pytest
 
 from helpers import ENV_ID, TINY
 from sb3_htr import PEARL
+from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.pearl.horizon import settings_for, timesteps_for
+from sb3_htr.pearl.untrusted import load_untrusted
 
 NAMES = ("gamma", "n_steps", "n_episodes_per_task", "learning_starts", "gradient_steps", "batch_size", "context_size")
 
@@ -62,6 +65,20 @@ def test_a_loaded_model_keeps_its_own(tmp_path: Any) -> None:
     model.save(tmp_path / "model")
     loaded = PEARL.load(tmp_path / "model", env=gym.make(ENV_ID, max_episode_steps=200))
     assert {name: getattr(loaded, name) for name in NAMES} == {name: getattr(model, name) for name in NAMES}
+
+
+def test_what_follows_from_another_training_is_warned_of(tmp_path: Any) -> None:
+    make(20).save(tmp_path / "model")
+    longer = gym.make(ENV_ID, max_episode_steps=200)
+    for load in (PEARL.load, load_untrusted):
+        with pytest.warns(UserWarning, match="The env's time limit is 200 steps, and what follows from it is still of 20"):
+            load(tmp_path / "model", env=longer)
+        with pytest.warns(UserWarning, match="A rollout is of 50 tasks, and what follows from that is still of 20"):
+            load(tmp_path / "model", env=make_task_vec_env(ENV_ID, 50))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            load(tmp_path / "model", env=make_task_vec_env(ENV_ID, 4))  # 20 tasks, four at a time
+            load(tmp_path / "model", env=gym.make(ENV_ID))
 
 
 def test_learn_has_a_budget_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -163,6 +163,8 @@ def test_floor_and_ceiling_of_the_point_robot() -> None:
     returns, successes = evaluate_adaptation(straight, ENV_ID, n_episodes=2)
     assert successes.all() and 13.3 < returns.mean() < 13.4
     floor = ScriptedAgent(space)
+    with pytest.raises(ValueError, match="ScriptedAgent has no explorers, but the explorer is 'belieff': leave it out"):
+        floor.start_adaptation(1, "belieff")
     returns, successes = evaluate_adaptation(floor, ENV_ID, n_episodes=3)
     assert returns.mean() < 0.1 and successes.mean() < 0.02
     walks = [record_adaptation(floor, ENV_ID, n_episodes=1, seed=seed).achieved for seed in (0, 0, 1)]

@@ -12,8 +12,11 @@ from typing import Any, cast
 import gymnasium as gym
 import numpy as np
 import pytest
+import rl_zoo3.train
 import yaml
 from gymnasium.envs.registration import EnvSpec
+from rl_zoo3 import exp_manager
+from stable_baselines3.common.callbacks import EvalCallback
 
 import sb3_htr
 from helpers import ENV_ID, TINY
@@ -95,6 +98,10 @@ def test_normalized_runs_are_evaluated_as_they_were_trained(tmp_path: Path) -> N
     # The same model, tasks and seed as in the evaluation during training
     during = np.load(run / "evaluations.npz")["returns"][0]
     np.testing.assert_allclose(np.load(run / "adaptation.npz")["returns"], during, atol=1e-4)
+
+
+def test_rl_zoo_is_left_as_it_was(runs: Path) -> None:
+    assert exp_manager.EvalCallback is EvalCallback and {"ppo", "sac"} < {*rl_zoo3.train.ALGOS}
 
 
 def test_env_kwargs_of_the_yaml_reach_the_evaluation(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -495,10 +495,13 @@ def run_rl_zoo(
         },
         rl_zoo3.train: {"ExperimentManager": manager, "ALGOS": {algorithm.name: algorithm.model_class()}},
     }
-    for module, classes in replaced.items():
-        vars(module).update(classes)
+    theirs = {module: {name: vars(module)[name] for name in ours} for module, ours in replaced.items()}
     before, sys.argv = sys.argv, [program, *arguments]
     try:
+        for module, ours in replaced.items():
+            vars(module).update(ours)
         rl_zoo3.train.train()
     finally:
         sys.argv = before
+        for module, names in theirs.items():
+            vars(module).update(names)
