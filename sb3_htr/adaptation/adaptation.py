@@ -86,7 +86,7 @@ class Adaptation:
         self._running: list[np.ndarray] = []
         self._n_steps = np.zeros(n_envs, dtype=np.int64)
         self._state = policy.encoder.empty(n_envs)
-        self._watch = None if is_training else knowledge.watch(n_envs)
+        self._watch = None if is_training else knowledge.reward_watch(n_envs)
         self.explorer = explorer.begin(self)
 
     @property

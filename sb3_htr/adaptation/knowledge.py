@@ -79,7 +79,7 @@ class LatentKnowledge(nn.Module):
         """Whether some rewards tell a success. In a family that has no successes, none does: the threshold is infinite."""
         return bool(self.threshold < float("inf"))
 
-    def watch(self, n_envs: int) -> RewardWatch | None:
+    def reward_watch(self, n_envs: int) -> RewardWatch | None:
         """
         :param n_envs: number of envs of an adaptation
         :return: what notices rewards unlike those of meta-training; None if no task was solved there by which one could

@@ -59,7 +59,7 @@ class NoGivingUp(Belief):
 class NoInference(Belief):
     """What the reward model says of rewards is ignored: the belief stays as it was beforehand."""
 
-    def infer(self, step: Step) -> None:
+    def update_belief(self, step: Step) -> None:
         pass
 
 

@@ -184,7 +184,7 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
             obs_z = th.cat([normal, th.as_tensor(z, device=self.device)], dim=1)
             return np.asarray(self._act(obs_z, deterministic).cpu().numpy())
 
-    def watch(self, obs: np.ndarray) -> None:
+    def update_normalizer(self, obs: np.ndarray) -> None:
         """
         :param obs: (n, obs_dim), newly observed in training: what observations are normalized by follows them
         """

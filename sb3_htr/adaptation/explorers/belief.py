@@ -159,7 +159,7 @@ class Belief(ParticleExplorer):
         return np.asarray(values.cpu().numpy())
 
     def observe(self, step: "Step") -> None:
-        self.infer(step)
+        self.update_belief(step)
         self._n_steps += 1
         ended = np.flatnonzero(step.dones)
         if len(ended):

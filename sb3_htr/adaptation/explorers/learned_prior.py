@@ -45,7 +45,7 @@ class LearnedPrior(FixedExploration, ParticleExplorer):
         self.draw(np.arange(len(self.z)))
 
     def observe(self, step: "Step") -> None:
-        self.infer(step)
+        self.update_belief(step)
         super().observe(step)
 
     def draw(self, envs: np.ndarray) -> None:

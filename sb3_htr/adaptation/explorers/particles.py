@@ -71,7 +71,7 @@ class ParticleExplorer(Explorer):
         variance = weights @ z.square() - (weights @ z).square()
         return np.asarray(variance.clamp(min=0).sqrt().cpu().numpy())
 
-    def infer(self, step: "Step") -> None:
+    def update_belief(self, step: "Step") -> None:
         """
         One step of Bayes' rule.
 
