@@ -402,7 +402,9 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
                 check_reward_hook(replay_buffer.task_family, replay_buffer.transitions, self.task_bank.new, relabelled)
             # Now and not step by step: what a posterior takes in during a rollout stays on one scale
             columns = replay_buffer.transitions
-            self.policy.update_normalizer(np.concatenate([episode[:, columns.observation] for _, episode in self.task_bank.new]))
+            self.policy.update_normalizer(
+                np.concatenate([episode[:, columns.observation] for _, episode in self.task_bank.new])
+            )
             self.task_bank.update()
             if replay_buffer.tells_rewards:
                 self.logger.record("rollout/train_tasks_reached", self.task_bank.n_train_solved)

@@ -12,12 +12,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from helpers import ENV_ID, PRIOR, ROLLOUT, MakePEARL
 from helpers.adaptations import know_tasks
-from htr_envs import PointRobotFamily
+from htr_envs import DynamicsVectorEnv, PointRobotFamily
+from htr_envs.point_robot import PointRobotDynamics
 from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.adaptation import Belief, Prior, evaluation
 from sb3_htr.adaptation.evaluation import record_adaptation
 from sb3_htr.common.random_state import get_env_states
-from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
 
 
 @pytest.mark.parametrize("explorer", ["prior", "aggregate", "belief", "learned-prior"])
@@ -258,3 +259,27 @@ def test_tasks_have_the_same_episodes_by_name_and_as_an_array(tiny_pearl: MakePE
     np.testing.assert_array_equal(by_name, as_array)
     evaluate_adaptation(model, ENV_ID, tasks[:3], n_episodes=1)
     assert max(made) == 20 and made[-1] == 3, "neither 100 envs for as many tasks, nor 20 for three"
+
+
+def test_tasks_of_a_later_batch_have_noise_of_their_own(tiny_pearl: MakePEARL) -> None:
+    tasks = np.full((4, 2), 9.0, dtype=np.float32)
+    record = record_adaptation(tiny_pearl(), make_task_vec_env(ENV_ID, 2), tasks, n_episodes=1, explorer=PRIOR)
+    assert len(np.unique(record.achieved[:, 0, -1], axis=0)) == 4
+
+
+class Scattered(PointRobotDynamics):
+    """Point robots that begin anywhere near."""
+
+    def reset(self, indices: Any, rng: np.random.Generator) -> Any:
+        self.states[indices] = rng.uniform(-0.5, 0.5, (len(indices), 2))
+        return self.states[indices]
+
+
+def test_an_evaluation_of_a_seed_has_the_same_starts_whatever_was_played_before(tiny_pearl: MakePEARL) -> None:
+    model, paths = tiny_pearl(), []
+    for own, seed in ((5, 0), (6, 0), (6, 1)):
+        env = BatchedTaskVecEnv(DynamicsVectorEnv(PointRobotFamily(), Scattered(4), max_episode_steps=20))
+        env.seed(own)
+        paths.append(record_adaptation(model, env, PointRobotFamily().test_tasks[:4], n_episodes=1, seed=seed).achieved)
+    np.testing.assert_array_equal(paths[0], paths[1])
+    assert (paths[0][:, 0, 0] != paths[2][:, 0, 0]).all()

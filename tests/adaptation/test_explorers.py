@@ -436,3 +436,73 @@ def test_what_is_known_about_z_before_a_reward(tiny_pearl: MakePEARL) -> None:
         np.testing.assert_allclose(adaptation.explorer.deviation(), np.full((4, 3), expected), rtol=1e-6)
         mean, deviation = adaptation.posterior()
         assert (mean == 0).all() and (deviation == 1).all() and mean.shape == (4, 3)
+
+
+def sure_of_the_first(model: Any, n: int = 4) -> np.ndarray:
+    known = know_tasks(model, n)
+    model.knowledge.log_prior[:n] = th.tensor([0.0, *[-4.0] * (n - 1)])
+    return known
+
+
+def test_it_goes_for_what_is_likely_though_the_critics_value_another_a_little_more(
+    tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = tiny_pearl()
+    known = sure_of_the_first(model)
+    monkeypatch.setattr(model.policy, "values", lambda obs, z: 1 + 0.1 * z[..., 0])
+    adaptation = begin(model, "belief")
+    adaptation.act(np.zeros((1, 2), dtype=np.float32))
+    np.testing.assert_array_equal(adaptation.z, known[:1])
+
+
+def test_it_goes_for_the_episode_that_earns_most_under_the_likely_task(
+    tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which may be that of another task."""
+    model = tiny_pearl()
+    known = sure_of_the_first(model)
+    monkeypatch.setattr(model.policy, "values", lambda obs, z: th.ones(z.shape[:2]))
+    model.knowledge.gain[1, 0] = model.knowledge.returns[1, 0] = 20.0
+    adaptation = begin(model, "belief")
+    adaptation.act(np.zeros((1, 2), dtype=np.float32))
+    np.testing.assert_array_equal(adaptation.z, known[1:2])
+    assert isinstance(adaptation.explorer, Belief)
+    adaptation.explorer._best_return[:] = 9.0  # found with several z
+    np.testing.assert_array_equal(adaptation.explorer.final_z(), known[1:2])
+
+
+@pytest.mark.filterwarnings("ignore:Each step returned")
+def test_what_promises_a_little_more_than_the_best_episode_is_not_tried(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    know_tasks(model, 3)
+    model.knowledge.returns[1, 0] = 5 * 3 * 1.01
+    places, rewards = walk(begin(model, "belief"), np.array([0.0]), n_episodes=8)
+    found = int((rewards[0].sum(axis=1) == 15).argmax())
+    assert rewards[0, found].sum() == 15 and 1.0 not in places[0, found + 1 :]
+
+
+def test_an_episode_that_is_a_little_better_is_no_new_word_of_the_encoder(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    know_tasks(model, 3)
+    adaptation, words = begin(model, "belief"), []
+    for returns in (5.0, 5.05, 6.0):
+        play(adaptation, [[returns]])
+        words.append(adaptation.posterior()[0])
+    assert (words[1] == words[0]).all() and (words[2] != words[0]).any()
+
+
+def test_the_share_of_hindsight_tasks_is_what_it_says(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    know_tasks(model, 6)
+    model.knowledge.is_train[4:6] = False
+    z = begin(model, LearnedPrior(hindsight_share=0.3), n_envs=4000).z
+    assert (z[:, 0] >= 4).mean() == pytest.approx(0.3, abs=0.03)
+
+
+def test_each_setback_widens_the_posterior_by_its_deviation(tiny_pearl: MakePEARL) -> None:
+    n = 4000
+    adaptation = begin(tiny_pearl(), "aggregate", n_envs=n)
+    z = play(adaptation, [[5.0] * n, [1.0] * n, [1.0] * n])
+    deviation = adaptation.posterior()[1][0]
+    for setbacks in (0, 1, 2):
+        np.testing.assert_allclose(z[1 + setbacks].std(axis=0), (1 + setbacks) * deviation, rtol=0.1)

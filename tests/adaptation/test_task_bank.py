@@ -9,11 +9,12 @@ import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
 
-from helpers import ENV_ID, ROLLOUT, MakePEARL
+from helpers import ENV_ID, ROLLOUT, MakePEARL, with_policy
+from helpers.adaptations import know_tasks
 from htr_envs import PointRobotFamily, Trajectory
 from sb3_htr import PEARL
 from sb3_htr.adaptation.knowledge import Particles
-from sb3_htr.adaptation.task_bank import TaskBank
+from sb3_htr.adaptation.task_bank import SolvedTasks, TaskBank
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr.transitions import Transitions
 
@@ -277,3 +278,39 @@ def test_particles_are_the_same_however_many_steps_are_looked_at_at_once(
             found.append(model.knowledge._solved(model.policy, model.task_bank, model.gamma))
     for one, other in zip(*found, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
+
+
+def test_what_is_known_of_solved_tasks_is_that_of_the_docstrings(tiny_pearl: MakePEARL, monkeypatch: Any) -> None:
+    """By hand, of three tasks on a line, at 0, 1 and 3: half a unit away from one, its chance is a half."""
+    model = tiny_pearl(policy_kwargs=with_policy(normalize_observations=False))
+    know_tasks(model, 3)
+    z = th.tensor([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]])
+    monkeypatch.setattr(model.policy, "infer", lambda context: (z, None))
+    columns = Transitions(model.observation_space, model.action_space)
+    rows = np.zeros((6, columns.width), dtype=np.float32)
+    rows[:, columns.next_observation] = np.array([[0, 0.5, 1, 1, 0, 3]]).T
+    rows[:, columns.reward] = [1, 5, 5, 5, 0, 5]
+    success, is_train = rows[:, columns.reward] > 0, np.array([True, True, False])
+    solved = SolvedTasks(rows, np.array([2, 3, 1]), success, np.array([6, 10, 5], dtype=np.float32), is_train)
+    bank: Any = type("Bank", (), {"transitions": columns, "solved": lambda self: solved})()
+    with th.no_grad():
+        particles = model.knowledge._solved(model.policy, bank, gamma=0.9)
+    th.testing.assert_close(particles.gain, th.tensor([[3.75, 1.25, 0], [0, 5, 0], [0, 0, 5]]), atol=1e-4, rtol=0)
+    th.testing.assert_close(particles.returns, th.tensor([[6.0, 2, 0], [0, 10, 0], [0, 0, 5]]), atol=1e-3, rtol=0)
+    # 1 / 1.25 for those that the first is like, 1 / 5 for two units from a training task
+    th.testing.assert_close(particles.log_prior.exp(), th.tensor([1, 0.8, 0.2]) / 2, atol=1e-4, rtol=0)
+    assert model.knowledge.threshold.item() == pytest.approx(0.5, abs=0.02), "between nothing and the smallest reward"
+
+
+def test_what_the_bank_keeps_of_a_long_episode_has_its_reward() -> None:
+    """Which lies between two of the steps that would be kept."""
+    env, family = gym.make(ENV_ID), PointRobotFamily(n_train_tasks=3)
+    bank = TaskBank(family, Transitions(env.observation_space, env.action_space), 5, seed=0)
+    rows = np.zeros((50, bank.transitions.width), dtype=np.float32)
+    rows[:, bank.transitions.next_observation] = 5.0
+    rows[22, bank.transitions.next_observation] = family.train_tasks[0]
+    bank.on_episode(0, rows)
+    bank.update()
+    solved = bank.solved()
+    (first,) = np.flatnonzero(solved.is_train)
+    assert np.split(solved.success, np.cumsum(solved.lengths)[:-1])[first].any()

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 import tables
 
+from helpers import ENV_ID
 from helpers.results import made_up
-from sb3_htr.experiments import figures, report
-from sb3_htr.experiments.grid import EXPERIMENTS, Experiment, Variant
+from sb3_htr.common.checks import get_task_family
+from sb3_htr.experiments import figures, protocol, report
+from sb3_htr.experiments.grid import EXPERIMENTS, Experiment, Variant, by
 from sb3_htr.experiments.protocol import METRICS
 from sb3_htr.experiments.runner import LOGGED
 from sb3_htr.zoo.run.method import methods
@@ -242,3 +244,27 @@ def test_a_slow_learner_needs_times_the_env_steps(tmp_path: Path, monkeypatch: p
         assert slowdown["iqm"] == pytest.approx(factor, abs=1e-3), "never counts as one evaluation more than there were"
         assert slowdown["n_unsolved"] == n_unsolved and slowdown["low"] == pytest.approx(factor, abs=1e-3)
         assert (slowdown["high"] is None) == (n_unsolved > 0), "how much later it would have been is not known"
+
+
+def test_the_last_episode_is_the_last_one_and_not_the_best_one() -> None:
+    raw = {"returns_a": np.array([[[0.0, 9, 2], [3, 4, 5]]])}
+    assert METRICS["last_episode_return"](raw, "a").tolist() == [[2, 5]]
+
+
+def test_a_final_model_adapts_to_the_test_tasks_once_with_each_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of where it is tested, where that is elsewhere than in training."""
+    asked: list[tuple[int, float]] = []
+
+    def noting(model: Any, env: Any, tasks: Any = None, *, n_episodes: int, explorer: Any, seed: int) -> Any:
+        assert tasks in (None, "test")
+        asked.append((seed, float(np.linalg.norm(get_task_family(env).test_tasks[0]).round(3))))
+        return np.zeros((env.num_envs, n_episodes)), np.zeros((env.num_envs, n_episodes), dtype=bool)
+
+    monkeypatch.setattr(protocol, "evaluate_adaptation", noting)
+    monkeypatch.setattr(protocol, "calibration", lambda *_: 0.0)
+    variant = Variant("htr-ser", env_kwargs={"n_test_tasks": 4, "goal_distance": 1.5})
+    evaluations = by(("prior",), {}, {"goal_distance": 2.0})
+    (cell,) = Experiment("one", "", ENV_ID, 480, (variant,), 1, evaluations=evaluations).cells()
+    arrays = protocol.evaluate(cell, None)  # type: ignore[arg-type]
+    assert asked == [(seed, distance) for distance in (1.5, 2.0) for seed in (1, 2, 3, 4, 5)]
+    assert arrays["returns_prior"].shape == (5, 4, 20)

@@ -191,3 +191,23 @@ def test_cells_that_the_start_does_not_solve_are_preferred() -> None:
         unsolved[prefer] = n_away / 40
     # One of eight steps is among the last five with probability .9
     assert unsolved[False] < 0.5 and unsolved[True] > 0.75
+
+
+@pytest.mark.parametrize("fraction", [0.3, 0.7])
+def test_so_many_episodes_of_hindsight_buffers_are_exploratory(fraction: float) -> None:
+    relabeller = {"name": "EpisodeClustering", "exploratory_fraction": fraction}
+    buffer, rng = make_buffer(buffer_size=16_000, relabeller=relabeller), np.random.default_rng(0)
+    for i in range(200):
+        add_episode(buffer, [i % 5, 5 + i % 7], 20, rng)
+    assert isinstance(buffer.relabeller, EpisodeClustering)
+    # Each of 400 episodes is in there once because it has solved the task
+    assert 1 - 400 / buffer.relabeller.episodes.n_added.sum() == pytest.approx(fraction, abs=0.03)
+
+
+def test_rows_are_drawn_from_each_hindsight_buffer() -> None:
+    buffer, rng = make_buffer(buffer_size=16_000, relabeller="EpisodeClustering"), np.random.default_rng(0)
+    for i in range(10):
+        add_episode(buffer, [i % 5, 5 + i % 5], 20, rng)
+    assert isinstance(buffer.relabeller, EpisodeClustering)
+    _, counts = np.unique(buffer.relabeller.draw(np.zeros(20_000, dtype=int)).tasks, axis=0, return_counts=True)
+    assert len(counts) == buffer.relabeller.n_hindsight_buffers and counts.min() > 0.8 * counts.mean()

@@ -358,3 +358,32 @@ def test_what_is_unrewarded_is_what_the_rewards_of_the_batch_say(n_steps: int) -
     without = [not rewards.any() for rewards in by_task(data.rewards.numpy(), data.lengths)]
     assert 0 < np.mean(without) < 1
     np.testing.assert_array_equal(data.unrewarded, without)
+
+
+@pytest.mark.parametrize("k", [0.0, 1.0])
+def test_contexts_are_of_the_latest_episodes_and_rl_batches_of_all(k: float) -> None:
+    """Of the task, or of the hindsight buffer, which is the only one here."""
+    one = {"name": "EpisodeClustering", "discretiser": np.zeros_like, "exploratory_fraction": 0.0}
+    settings: dict[str, Any] = {"relabel_probability": k, "relabeller": one, "context_episodes": 2}
+    buffer, rng = make_buffer(n_envs=1, buffer_size=16_000, **settings), np.random.default_rng(0)
+    for _ in range(6):
+        add_episode(buffer, [0], 20, rng)
+    assert isinstance(buffer.relabeller, EpisodeClustering)
+    store = buffer.relabeller.episodes if k else buffer.episodes
+    store.rows[store.index().rows, buffer.transitions.reward] = np.repeat(np.arange(6), 20)
+    data = buffer.sample(120, meta_batch_size=4, context_size=120)
+    assert set(data.context.rewards.tolist()) == {4, 5} and set(data.rewards.tolist()) == {0, 1, 2, 3, 4, 5}
+
+
+def test_labels_are_the_rewards_of_the_labelled_rows_under_the_tasks_of_the_meta_batch() -> None:
+    """Hindsight tasks, where rows are relabelled: at the place that a context has a reward of 1 for."""
+    relabeller = {"name": "SingleEpisodeRelabelling", "elsewhere": 0.0}
+    data = filled(n_episodes=12, relabel_probability=1.0, relabeller=relabeller).sample(8, meta_batch_size=16, n_labelled=50)
+    labels, context = data.labels, data.context
+    assert labels is not None and labels.inferred.all()
+    places = (context.observations + 0.1 * context.actions)[context.rewards == 1]
+    assert len(places) == 16
+    distance = (labels.next_observations[:, None] - places).norm(dim=-1)
+    expected, rim = (1 - distance) * (distance < FAMILY.goal_radius), (distance - FAMILY.goal_radius).abs() < 1e-4
+    th.testing.assert_close(labels.reward[~rim], expected[~rim], atol=1e-4, rtol=0)
+    assert th.equal(labels.next_observations, data.next_observations[labels.rows])

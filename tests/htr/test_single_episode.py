@@ -11,6 +11,7 @@ from helpers.experience import FAMILY, by_task, filled, make_buffer
 from htr_envs import Trajectory
 from sb3_htr.common.type_aliases import Context
 from sb3_htr.htr import HindsightTaskStrategy
+from sb3_htr.htr.relabel.hindsight_task import solved_at_start
 
 
 def relabelling(**settings: Any) -> dict[str, Any]:
@@ -228,3 +229,26 @@ def test_tasks_like_those_of_training_are_preferred_for_a_share(n_near: int) -> 
 def test_bad_settings(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make_buffer(**relabelling(**settings))
+
+
+def test_what_the_first_step_solves_was_not_solved_at_the_start() -> None:
+    zero, action, next_obs = np.zeros((1, 2), np.float32), np.array([[1, 0]], np.float32), np.array([[0.1, 0]], np.float32)
+    step: Any = Trajectory(zero, action, next_obs, zero[:, 0])
+    assert FAMILY.is_success(step, np.array([0.25, 0.0]))[0]
+    assert [bool(solved_at_start(FAMILY, step, np.array([x, 0.0]))) for x in (0.15, 0.25)] == [True, False]
+
+
+def test_the_rl_batch_of_a_task_is_of_the_task_that_the_context_is_of() -> None:
+    """Which is another one than was drawn, where nothing but that would do."""
+    relabeller = {"name": "SingleEpisodeRelabelling", "rl_batch_source": "task", "like_training": 0.0}
+    buffer = make_buffer(n_envs=1, buffer_size=16_000, relabel_probability=1.0, relabeller=relabeller)
+    for task, speed in ((0, 0.0), (1, 1.0)):
+        obs = np.zeros((1, 2), dtype=np.float32)
+        for step in range(20):
+            action = np.full((1, 2), speed, dtype=np.float32)
+            next_obs = obs + np.float32(0.1) * action
+            buffer.add(obs, next_obs, action, np.zeros(1), np.array([step == 19]), [{"task_id": task}])
+            obs = next_obs
+    draw = buffer.relabeller.draw(np.zeros(100, dtype=int))
+    assert (draw.context == [20, 40]).all(axis=1).mean() > 0.9, "the first does not move"
+    np.testing.assert_array_equal(draw.batch, draw.context, err_msg="each task has one episode")

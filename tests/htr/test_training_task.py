@@ -278,3 +278,71 @@ def test_rewards_may_be_of_double_precision(
     own = PointRobotFamily.compute_reward
     monkeypatch.setattr(PointRobotFamily, "compute_reward", lambda *a, **k: own(*a, **k).astype(np.float64))
     tiny_pearl(replay_buffer_kwargs={"relabel_probability": 1.0, "relabeller": kind}).learn(2 * ROLLOUT)
+
+
+class Judge:
+    """Of a policy: z says nothing, values are what ``told`` makes of observations and actions."""
+
+    device = th.device("cpu")
+
+    def __init__(self, told: Any) -> None:
+        self.told = told
+
+    def infer(self, context: Context) -> tuple[th.Tensor, th.Tensor]:
+        return th.zeros(len(context.lengths), 1), th.ones(len(context.lengths), 1)
+
+    def values(self, obs: np.ndarray, z: th.Tensor, actions: np.ndarray | None = None) -> th.Tensor:
+        return th.as_tensor(self.told(obs, actions)[:, None]).expand(z.shape[:2])
+
+
+def rows_of(buffer: Any, n_episodes: int) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    for _ in range(n_episodes):
+        add_episode(buffer, [0], 20, rng)
+    return np.asarray(buffer.episodes.take(np.arange(20 * n_episodes)))
+
+
+def test_foresight_is_from_the_same_starts_for_all_episodes() -> None:
+    buffer = make_buffer(n_envs=1, relabel_probability=1.0, relabeller=HindsightForesight(n_starts=4), buffer_size=16_000)
+    rows = rows_of(buffer, 4)
+    rows[::20, buffer.transitions.observation] = [[0, 0], [1, 0], [2, 0], [3, 0]]
+    assert isinstance(buffer.relabeller, HindsightForesight)
+    buffer.relabeller.policy = Judge(lambda obs, actions: obs[:, 0])
+    for _ in range(5):
+        assert np.ptp(buffer.relabeller.utilities(rows, np.full(4, 20))) < 1e-6
+
+
+def test_transitions_are_judged_by_what_was_done_in_them() -> None:
+    relabeller = HindsightInference(level="transition")
+    buffer = make_buffer(n_envs=1, relabel_probability=1.0, relabeller=relabeller, buffer_size=16_000)
+    rows = rows_of(buffer, 2)
+    assert isinstance(buffer.relabeller, HindsightInference)
+    buffer.relabeller.policy = Judge(lambda obs, actions: obs[:, 0] if actions is None else actions[:, 0])
+    utilities = buffer.relabeller.utilities(rows, np.full(2, 20))
+    np.testing.assert_allclose(utilities, np.tile(rows[:, [2]], (1, 80)))
+
+
+def test_z_of_a_task_is_of_what_was_relabelled_to_it_last() -> None:
+    relabeller: Any = HindsightInference(level="transition")
+    buffer, rng = (
+        make_buffer(n_envs=1, relabel_probability=1.0, relabeller=relabeller, buffer_size=16_000),
+        np.random.default_rng(0),
+    )
+    relabeller, seen = buffer.relabeller, list[Context]()
+
+    class Watched:
+        device = th.device("cpu")
+
+        def infer(self, context: Context) -> tuple[th.Tensor, th.Tensor]:
+            seen.append(context)
+            return th.zeros(len(context.lengths), 1), th.ones(len(context.lengths), 1)
+
+        def values(self, obs: np.ndarray, z: th.Tensor, actions: Any = None) -> th.Tensor:
+            return th.zeros(z.shape[:2])
+
+    relabeller.policy = Watched()
+    for _ in range(2):
+        add_episode(buffer, [0], 20, rng)
+        buffer.sample(4, meta_batch_size=4)
+        relabeller.episodes.rows[:, buffer.transitions.reward] = 7.0
+    assert not (seen[0].rewards == 7).any() and (seen[1].rewards == 7).any()

@@ -251,3 +251,11 @@ def test_no_picture_without_a_render_mode() -> None:
     assert env.render() is None
     with pytest.raises(ValueError, match="render_mode"):
         PointRobotEnv(render_mode="human")
+
+
+def test_validation_and_test_tasks_are_drawn_apart_and_in_no_order() -> None:
+    family = PointRobotFamily()
+    validation, test = (np.arctan2(tasks[:, 1], tasks[:, 0]) / np.pi for tasks in (family.validation_tasks, family.test_tasks))
+    assert not (np.diff(test) > 0).all() and not (np.diff(validation) > 0).all()
+    within = [np.sort(places) * len(places) % 1 for places in (validation, test)]
+    assert not np.isclose(within[0], within[1][:20], atol=1e-3).any()

@@ -1,5 +1,6 @@
 """The model of rewards learns which states solve which tasks, and what they return."""
 
+import numpy as np
 import pytest
 import torch as th
 
@@ -62,3 +63,22 @@ def test_a_deviation_that_became_too_small_grows_again() -> None:
     _, loss = model.losses(th.randn(64, 2), th.randn(8, 2), labels)
     loss.backward()
     assert model.log_std.grad is not None and model.log_std.grad < 0, "descent makes it larger"
+
+
+def test_losses_of_the_reward_model_are_those_of_the_docstring() -> None:
+    th.manual_seed(0)
+    model, next_obs, z = RewardModel(2, 1, 2), th.randn(5, 2), th.randn(3, 2)
+    reward = th.tensor([[2.0, 0, 1], [0, 0, 0], [0, 3, 0], [1, 1, 1], [0, 0, 2]])
+    labels = RewardLabels(th.arange(5), next_obs, reward, th.zeros(5), th.tensor([1.0, 0, 1]))
+    with th.no_grad():
+        model.log_std.fill_(-0.4)
+        model.scale.fill_(2.0)
+        cross_entropy, nll = model.losses(next_obs, z, labels)
+        states, tasks = model.state_tower(next_obs), model.task_tower(z)
+        mean, success = model.success_rewards(states, tasks), (reward > 0).float()
+        expected = th.distributions.Normal(mean / model.scale, model.log_std.exp()).log_prob(reward / model.scale)
+        density = -(expected + 0.5 * th.tensor(2 * th.pi).log()) * success
+        chance = th.distributions.Bernoulli(logits=model.success_logits(states, tasks)).log_prob(success)
+    th.testing.assert_close(nll, density[:, [0, 2]].mean())
+    th.testing.assert_close(cross_entropy, -chance[:, [0, 2]].mean())
+    assert model.deviation.item() == pytest.approx(model.scale.item() * np.exp(-0.4))

@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from helpers import ENV_ID
 from helpers.carts import make_cart
+from helpers.envs import times_three
 from sb3_htr import evaluate_adaptation
 from sb3_htr.adaptation.adaptation import Step
 from sb3_htr.common.vec_env import make_task_vec_env
@@ -184,3 +185,10 @@ def test_an_env_with_another_time_limit_is_refused_and_not_trained_on() -> None:
     with pytest.raises(ValueError, match="give an env of the same time limit"):
         model.set_env(make_task_vec_env(ENV_ID, 2, env_kwargs={"max_episode_steps": 10}))
     assert model.env is env
+
+
+def test_the_policy_of_trials_sees_actions_scaled() -> None:
+    env = TrialVecEnv(make_task_vec_env(ENV_ID, 2, seed=0, wrapper=times_three), n_episodes=2)
+    env.reset()
+    obs, *_ = env.step(np.array([[3.0, -1.5], [0.0, 3.0]], dtype=np.float32))
+    np.testing.assert_allclose(np.asarray(obs)[:, 2:4], np.array([[1, -0.5], [0, 1]]), atol=1e-6)

@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from helpers import ENV_ID
 from helpers.carts import make_cart
+from helpers.envs import times_three
 from htr_envs import DynamicsVectorEnv, PointRobotFamily
 from htr_envs.point_robot import PointRobotDynamics
 from sb3_htr import evaluate_adaptation
@@ -216,3 +217,62 @@ def test_replay_of_another_family_or_number_of_envs_is_refused_and_not_learnt_fr
         assert model.replay_buffer is before
     model.load_replay_buffer(tmp_path / "same")
     assert model.replay_buffer is not before and model.learn(80).num_timesteps == 80
+
+
+def test_a_replay_that_began_anew_is_saved_whole() -> None:
+    """Of 50 steps of each env, after 60."""
+    model, other = tiny_sac_her(buffer_size=200).learn(240), tiny_sac_her(buffer_size=200)
+    other.load_state_dict(copy.deepcopy(model.state_dict()))
+    ours, theirs = model.replay_buffer, other.replay_buffer
+    assert isinstance(ours, TaskHerReplayBuffer) and isinstance(theirs, TaskHerReplayBuffer)
+    assert ours.full and theirs.full and ours.pos == theirs.pos == 10
+    for name, array in ours._arrays().items():
+        np.testing.assert_array_equal(theirs._arrays()[name], array, err_msg=name)
+    np.testing.assert_array_equal(theirs._current_ep_start, ours._current_ep_start)
+
+
+def test_a_rollout_that_ends_within_an_episode_ends_it_in_the_replay() -> None:
+    env = BatchedTaskVecEnv(DynamicsVectorEnv(PointRobotFamily(), FallingDynamics(4), max_episode_steps=20))
+    replay = tiny_sac_her(env).learn(480).replay_buffer
+    assert isinstance(replay, TaskHerReplayBuffer) and not replay.full
+    first, then = slice(0, replay.pos - 1), slice(1, replay.pos)
+    is_one = replay.ep_start[first] == replay.ep_start[then]
+    follows = (replay.next_observations["observation"][first] == replay.observations["observation"][then]).all(axis=-1)
+    assert follows[is_one].all() and not is_one.all()
+
+
+class Costly(PointRobotDynamics):
+    def step(self, actions: Any) -> Any:
+        states, _, ends = super().step(actions)
+        return states, np.full(self.num_envs, -0.25, dtype=np.float32), ends
+
+
+def test_a_relabelled_step_costs_what_it_cost() -> None:
+    env = BatchedTaskVecEnv(DynamicsVectorEnv(PointRobotFamily(), Costly(4), max_episode_steps=20))
+    replay = tiny_sac_her(env).learn(400).replay_buffer
+    assert isinstance(replay, TaskHerReplayBuffer)
+    data = replay.sample(400)
+    distance = np.linalg.norm((data.observations["desired_goal"] - data.next_observations["observation"]).numpy(), axis=1)
+    np.testing.assert_allclose(data.rewards[:, 0], np.where(distance < 0.2, 1 - distance, 0) - 0.25, atol=1e-5)
+
+
+def test_hindsight_rewards_are_of_actions_in_the_bounds_of_the_env(monkeypatch: pytest.MonkeyPatch) -> None:
+    replay = tiny_sac_her(make_task_vec_env(ENV_ID, 4, seed=0, wrapper=times_three)).learn(160).replay_buffer
+    assert isinstance(replay, TaskHerReplayBuffer)
+    seen: list[float] = []
+    own = PointRobotFamily.compute_reward
+
+    def noting(family: Any, traj: Any, *args: Any) -> Any:
+        seen.append(float(np.abs(traj.actions).max()))
+        return own(family, traj, *args)
+
+    monkeypatch.setattr(PointRobotFamily, "compute_reward", noting)
+    replay.sample(100)
+    assert min(seen) > 2
+
+
+def test_an_agent_that_is_told_its_task_can_sample_its_actions() -> None:
+    model = tiny_sac_her(make_task_vec_env(ENV_ID, 4, seed=0))
+    tasks = PointRobotFamily().test_tasks[:4]
+    sampled, mean = (record_adaptation(model, ENV_ID, tasks, 1, deterministic=d).achieved for d in (False, True))
+    assert not np.allclose(sampled, mean, atol=1e-2)

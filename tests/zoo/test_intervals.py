@@ -38,3 +38,7 @@ def test_a_task_that_is_hard_for_both_is_no_difference() -> None:
     assert (estimate, low, high) == pytest.approx((1, 1, 1))
     low, high = iqm_difference(np.array([11.0, 12, 13, 12, 12]), np.array([1.0, 2, 3, 2, 2]))[1:]
     assert 8 <= low < 10 < high <= 12
+
+
+def test_the_best_and_the_worst_count_for_nothing() -> None:
+    assert iqm_interval(np.array([0.0, *[10] * 38, 1000])) == (10, 10, 10)
