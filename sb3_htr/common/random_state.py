@@ -83,6 +83,9 @@ def kept_env_states(env: VecEnv) -> Iterator[None]:
     states = get_env_states(env) if env.has_attr("np_random") else None
     try:
         yield
+    except (EOFError, ConnectionError):
+        states = None  # the process of an env died, which has no state any more
+        raise
     finally:
         if states is not None:
             set_env_states(env, states)

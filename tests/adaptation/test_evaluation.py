@@ -1,5 +1,6 @@
 """Meta-test: the known mistakes of PEARL implementations, and agents adapted to one task."""
 
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from helpers import ENV_ID, PRIOR, ROLLOUT, MakePEARL
 from helpers.adaptations import know_tasks
@@ -228,6 +229,20 @@ def test_an_evaluation_in_the_env_of_training_leaves_its_random_state_alone(tiny
     assert len({*before}) == (1 if batched else 4)
     evaluate_adaptation(model, env, n_episodes=1)
     assert get_env_states(env) == before
+
+
+class Dying(gym.Wrapper[Any, Any, Any, Any]):
+    """Its process ends in its first step."""
+
+    def step(self, action: Any) -> Any:
+        os._exit(1)
+
+
+def test_the_error_of_a_dead_env_process_is_told_as_it_is(tiny_pearl: MakePEARL) -> None:
+    """And not that of putting its random state back."""
+    env = make_task_vec_env(ENV_ID, 2, wrapper=Dying, vec_env_class=SubprocVecEnv)
+    with pytest.raises(EOFError):
+        evaluate_adaptation(tiny_pearl(), env, n_episodes=1)
 
 
 def test_no_two_evaluations_share_noise(tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch) -> None:
