@@ -114,7 +114,7 @@ def make_model(n_episodes_per_task: int = 60, relabel_probability: float = 0.8, 
     # A context of 1024 steps needs 52 episodes
     buffer = {"relabel_probability": relabel_probability, "context_episodes": 60}
     sizes = {"n_tasks_per_rollout": 16, "n_episodes_per_task": n_episodes_per_task, "learning_starts": 10**9}
-    model = PEARL("MlpPolicy", env, replay_buffer_kwargs=buffer, seed=0, device="cpu", **{**sizes, **kwargs})
+    model = PEARL("MlpPolicy", env, replay_buffer_kwargs=buffer, seed=0, **{"device": "cpu", **sizes, **kwargs})
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Nothing was learnt")
         return model.learn(16 * 20 * n_episodes_per_task, log_interval=None)

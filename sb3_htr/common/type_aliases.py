@@ -68,6 +68,7 @@ class RewardLabels(NamedTuple):
     What n of the transitions of a meta-batch would return under each of its M tasks: what a model of rewards learns from.
 
     :param rows: (n,) int64, which transitions of the RL batch
+    :param weights: (n,) float32, of each in a mean over them
     :param next_observations: (n, obs_dim), where their one step leads
     :param reward: (n, M) float32, its reward beside the task-free one, above 0 where the transition solves the task
     :param task_free: (n,) float32, the task-free one
@@ -75,6 +76,7 @@ class RewardLabels(NamedTuple):
     """
 
     rows: th.Tensor
+    weights: th.Tensor
     next_observations: th.Tensor
     reward: th.Tensor
     task_free: th.Tensor
@@ -96,6 +98,7 @@ class MultiTaskSamples(NamedTuple):
     :param dones: (N,), 1 where the episode terminated (time limits do not count)
     :param discounts: (N,), of the value of the next observation
     :param lengths: (M,) int64, how many of these transitions are of each task, at least 1
+    :param task_weights: (M,), of each task in a mean over tasks, whatever its length
     :param task_ids: (M,) int array, the training task that was drawn for each row of the meta-batch; a relabelled row may
         have the experience of other ones
     :param relabelled: (M,) bool array, whether context and RL batch carry rewards of a hindsight task
@@ -111,6 +114,7 @@ class MultiTaskSamples(NamedTuple):
     dones: th.Tensor
     discounts: th.Tensor
     lengths: th.Tensor
+    task_weights: th.Tensor
     task_ids: np.ndarray
     relabelled: np.ndarray
     unrewarded: np.ndarray

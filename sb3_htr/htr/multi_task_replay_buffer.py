@@ -53,6 +53,11 @@ def spread(rng: np.random.Generator, ranges: np.ndarray, width: int) -> tuple[np
     return position + np.repeat(ranges[:, 0], size), size
 
 
+def _equal_weights(n: int) -> np.ndarray:
+    """(n,), of each in a mean over all."""
+    return np.full(n, 1.0 / n, dtype=np.float32)
+
+
 class MultiTaskReplayBuffer(ReplayBuffer):
     """
     Replay buffer of a family of tasks, with hindsight task relabelling in :meth:`sample`.
@@ -412,6 +417,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             dones=self._tensor(last[:, columns.done]),
             discounts=self._tensor(discounts),
             lengths=self._tensor(n_batch),
+            task_weights=self._tensor(_equal_weights(meta_batch_size)),
             task_ids=tasks,
             relabelled=relabelled,
             unrewarded=np.logical_and.reduceat(beside <= ROUNDING, first_rows(n_batch)),
@@ -455,6 +461,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         inferred = np.logical_or.reduceat(rewarded, first_rows(n_context))
         return RewardLabels(
             rows=self._tensor(chosen),
+            weights=self._tensor(_equal_weights(len(chosen))),
             next_observations=self._tensor(traj.next_observations),
             reward=self._tensor(np.ascontiguousarray(reward.T, dtype=np.float32)),
             task_free=self._tensor(traj.task_free_reward),

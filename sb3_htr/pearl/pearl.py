@@ -7,15 +7,19 @@ import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.explorers import Explorer
+from sb3_htr.adaptation.task_bank import TaskBank
 from sb3_htr.common.matmul import PRECISIONS, matmul_precision
-from sb3_htr.common.settings import check_numbers
-from sb3_htr.common.type_aliases import RewardLabels
+from sb3_htr.common.settings import check_flags, check_numbers
+from sb3_htr.common.type_aliases import MultiTaskSamples, RewardLabels
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.pearl.divergence import PosteriorWatch, check_finite
 from sb3_htr.pearl.encoder import ContextEncoder, kl_to_prior
+from sb3_htr.pearl.graphed_update import FixedUpdate, GraphedUpdate, Outcome
 from sb3_htr.pearl.off_policy_meta_algorithm import OffPolicyMetaAlgorithm
+from sb3_htr.pearl.padding import padded
 from sb3_htr.pearl.policies import LatentCritic, MlpPolicy, PEARLPolicy
 
 # By measurement on validation tasks of the Point Robot
@@ -81,6 +85,8 @@ class PEARL(OffPolicyMetaAlgorithm):
     :param train_explorer: the same for rollouts
     :param matmul_precision: of matrix products in updates, as for ``torch.set_float32_matmul_precision``. ``"medium"`` rounds
         their factors to bfloat16, which is faster where the processor has such products (docs/performance.md)
+    :param cuda_graph: an update is one CUDA graph, for meta-batches that are filled up to ``batch_size`` and ``context_size``
+        rows of each task. On a CPU they are filled up alike, and the update is what it always is
     :param stats_window_size: episodes over which logged returns are averaged
     :param tensorboard_log: folder for TensorBoard, none by default
     :param policy_kwargs: arguments of the policy: ``latent_dim``, ``net_arch``, ``encoder_arch`` (paper: 5, 3x300, 3x200),
@@ -127,6 +133,7 @@ class PEARL(OffPolicyMetaAlgorithm):
         explorer: Explorer | dict[str, Any] | str = "belief",
         train_explorer: Explorer | dict[str, Any] | str = "aggregate",
         matmul_precision: str = "highest",
+        cuda_graph: bool = False,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -168,6 +175,7 @@ class PEARL(OffPolicyMetaAlgorithm):
         self.final_kl_coef = final_kl_coef
         self.reward_coef = reward_coef
         self.matmul_precision = matmul_precision
+        self.cuda_graph = cuda_graph
         self._posterior_watch = PosteriorWatch()
         if _init_setup_model:
             self._setup_model()
@@ -191,9 +199,17 @@ class PEARL(OffPolicyMetaAlgorithm):
             raise ValueError("tau is 0, with which the target critics would never learn: expected a number above 0, up to 1.")
         if self.final_kl_coef is not None and 0 in (self.kl_coef, self.final_kl_coef):
             raise ValueError("kl_coef and final_kl_coef are a factor apart, so neither may be 0: expected numbers above 0.")
+        check_flags(cuda_graph=self.cuda_graph)
         if self.matmul_precision not in PRECISIONS:
             raise ValueError(f"matmul_precision is {self.matmul_precision!r}, expected one of {list(PRECISIONS)}.")
         super()._setup_model()
+
+    def _make_replay(self, env: VecEnv) -> tuple[MultiTaskReplayBuffer, TaskBank]:
+        replay_buffer, task_bank = super()._make_replay(env)
+        if self.cuda_graph:
+            # Where a meta-batch is filled up, and from where one copy brings all of it
+            replay_buffer.device = th.device("cpu")
+        return replay_buffer, task_bank
 
     def _create_aliases(self) -> None:
         super()._create_aliases()
@@ -213,8 +229,9 @@ class PEARL(OffPolicyMetaAlgorithm):
         if self.ent_coef_optimizer is not None:
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
+        learn = self._fixed_update(optimizers) if self.cuda_graph else None
         with matmul_precision(self.matmul_precision):
-            means, logs = zip(*(self._update(batch_size) for _ in range(gradient_steps)), strict=True)
+            means, logs = zip(*(self._update(batch_size, learn) for _ in range(gradient_steps)), strict=True)
         log_means = {key: th.stack([log[key] for log in logs]).mean().item() for key in logs[0]}
         check_finite(self.policy, log_means, self._n_updates, self.num_timesteps)
         self._posterior_watch.check(log_means["kl_divergence"])
@@ -233,8 +250,19 @@ class PEARL(OffPolicyMetaAlgorithm):
             return self.kl_coef
         return float(self.kl_coef * (self.final_kl_coef / self.kl_coef) ** (1.0 - self._current_progress_remaining))
 
-    def _update(self, batch_size: int) -> tuple[th.Tensor, dict[str, th.Tensor]]:
-        """One update of all networks. Posterior means (M, latent_dim), and what to log."""
+    def _fixed_update(self, optimizers: list[th.optim.Optimizer]) -> FixedUpdate:
+        if self.device.type == "cuda":
+            return GraphedUpdate(self._learn, self.device, optimizers)
+        return FixedUpdate(self._learn, self.device)
+
+    def _update(self, batch_size: int, learn: FixedUpdate | None = None) -> Outcome:
+        """
+        One update of all networks.
+
+        :param batch_size: transitions per task for actor and critics
+        :param learn: what learns from a meta-batch that is filled up
+        :return: posterior means (M, latent_dim), and what to log
+        """
         assert self.replay_buffer is not None
         data = self.replay_buffer.sample(
             batch_size,
@@ -244,12 +272,28 @@ class PEARL(OffPolicyMetaAlgorithm):
             n_steps=self.n_steps,
             gamma=self.gamma,
         )
+        self._n_updates += 1
+        update_target = self._n_updates % self.target_update_interval == 0
+        if learn is None:
+            mean, log = self._learn(data, update_target)
+        else:
+            n = self.meta_batch_size
+            sizes = n * self.context_size + 1, n * batch_size + 1, min(N_LABELLED, n * batch_size)
+            mean, log = learn(padded(data, *sizes), update_target)
+        log["relabelled_fraction"] = th.tensor(data.relabelled.mean())
+        log["rl_zero_reward_fraction"] = th.tensor(data.unrewarded.mean())
+        for listener in self.update_listeners:
+            listener()
+        return mean[: self.meta_batch_size], log
+
+    def _learn(self, data: MultiTaskSamples, update_target: bool) -> Outcome:
+        """The part of an update that a GPU does, and that can be captured: it waits for no value."""
         # Each task has the same weight in a mean over transitions
-        weight = (1.0 / (self.meta_batch_size * data.lengths)).repeat_interleave(data.lengths, output_size=len(data.rewards))
+        weight = (data.task_weights / data.lengths).repeat_interleave(data.lengths, output_size=len(data.rewards))
         # One backward pass through the encoder: it learns from the critics' errors, the KL term and the reward model's errors
         mean, variance = self.policy.infer(data.context)
         z = mean + variance.sqrt() * th.randn_like(mean)
-        kl = kl_to_prior(mean, variance).mean()
+        kl = (kl_to_prior(mean, variance) * data.task_weights).sum()
         z_rows = z.repeat_interleave(data.lengths, dim=0, output_size=len(data.rewards))
         obs, next_obs = self.policy.normalize(data.observations), self.policy.normalize(data.next_observations)
         obs_z = th.cat([obs, z_rows], dim=1)
@@ -290,8 +334,7 @@ class PEARL(OffPolicyMetaAlgorithm):
             self.ent_coef_optimizer.zero_grad()
             ent_coef_loss.backward()
             self.ent_coef_optimizer.step()
-        self._n_updates += 1
-        if self._n_updates % self.target_update_interval == 0:
+        if update_target:
             with th.no_grad():
                 th._foreach_lerp_(list(self.critic_target.parameters()), list(self.critic.parameters()), self.tau)
         log = {
@@ -300,14 +343,10 @@ class PEARL(OffPolicyMetaAlgorithm):
             "kl_divergence": kl.detach(),
             **{key: value.detach() for key, value in reward_losses.items()},
             "ent_coef": ent_coef.detach().mean(),
-            "posterior_std": variance.detach().sqrt().mean(),
+            "posterior_std": (variance.detach().sqrt().mean(dim=1) * data.task_weights).sum(),
             "q_value": (q.detach().mean(dim=0) * weight).sum(),
-            "relabelled_fraction": th.tensor(data.relabelled.mean()),
             "rl_reward_mean": (data.rewards * weight).sum(),
-            "rl_zero_reward_fraction": th.tensor(data.unrewarded.mean()),
         }
-        for listener in self.update_listeners:
-            listener()
         return mean.detach(), log
 
     def _reward_losses(self, labels: RewardLabels, obs: th.Tensor, actions: th.Tensor, z: th.Tensor) -> dict[str, th.Tensor]:
@@ -318,7 +357,7 @@ class PEARL(OffPolicyMetaAlgorithm):
         return {
             "success_loss": success_loss,
             "reward_loss": reward_loss,
-            "task_free_loss": task_free_error.square().mean(),
+            "task_free_loss": (task_free_error.square() * labels.weights).sum(),
         }
 
     def _excluded_save_params(self) -> list[str]:

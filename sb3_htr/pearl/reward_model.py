@@ -91,7 +91,7 @@ class RewardModel(nn.Module):
         """
         states, tasks = self.state_tower(next_obs), self.task_tower(z)
         # z that was inferred without a reward can be of any task
-        weight = labels.inferred / (labels.inferred.sum().clamp(min=1) * len(states))
+        weight = labels.weights[:, None] * (labels.inferred / labels.inferred.sum().clamp(min=1))
         success = (labels.reward > 0).to(labels.reward.dtype)
         cross_entropy = F.binary_cross_entropy_with_logits(self.success_logits(states, tasks), success, reduction="none")
         with th.no_grad():

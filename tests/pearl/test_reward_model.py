@@ -15,7 +15,8 @@ def labelled(n_states: int, goals: th.Tensor, inferred: th.Tensor) -> tuple[th.T
     states = 2 * th.rand(n_states, 2) - 1
     distance = th.cdist(states, goals)
     reward = (1 - distance) * (distance < RADIUS)
-    return states, RewardLabels(th.arange(n_states), states, reward, th.zeros(n_states), inferred)
+    weights = th.full((n_states,), 1 / n_states)
+    return states, RewardLabels(th.arange(n_states), weights, states, reward, th.zeros(n_states), inferred)
 
 
 def test_it_learns_what_solves_a_task_and_what_that_returns() -> None:
@@ -57,7 +58,7 @@ def test_a_deviation_that_became_too_small_grows_again() -> None:
     """Also from below its bound, where an update can leave it."""
     model = RewardModel(2, 1, 2)
     reward = 1 + 0.5 * th.randn(64, 8).abs()
-    labels = RewardLabels(th.arange(64), th.zeros(64, 2), reward, th.zeros(64), th.ones(8))
+    labels = RewardLabels(th.arange(64), th.full((64,), 1 / 64), th.zeros(64, 2), reward, th.zeros(64), th.ones(8))
     with th.no_grad():
         model.log_std.fill_(MIN_LOG_STD - 0.01)
     _, loss = model.losses(th.randn(64, 2), th.randn(8, 2), labels)
@@ -69,7 +70,7 @@ def test_losses_of_the_reward_model_are_those_of_the_docstring() -> None:
     th.manual_seed(0)
     model, next_obs, z = RewardModel(2, 1, 2), th.randn(5, 2), th.randn(3, 2)
     reward = th.tensor([[2.0, 0, 1], [0, 0, 0], [0, 3, 0], [1, 1, 1], [0, 0, 2]])
-    labels = RewardLabels(th.arange(5), next_obs, reward, th.zeros(5), th.tensor([1.0, 0, 1]))
+    labels = RewardLabels(th.arange(5), th.full((5,), 1 / 5), next_obs, reward, th.zeros(5), th.tensor([1.0, 0, 1]))
     with th.no_grad():
         model.log_std.fill_(-0.4)
         model.scale.fill_(2.0)

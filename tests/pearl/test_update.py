@@ -61,7 +61,7 @@ def test_an_update_is_that_of_the_formulas(tiny_pearl: MakePEARL, monkeypatch: p
 def test_the_aggregate_is_of_the_latest_updates(tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch) -> None:
     model, number = tiny_pearl().learn(2 * ROLLOUT), count()
     update = model._update
-    monkeypatch.setattr(model, "_update", lambda size: (th.full((1, 3), float(next(number))), update(size)[1]))
+    monkeypatch.setattr(model, "_update", lambda *given: (th.full((1, 3), float(next(number))), update(*given)[1]))
     model.train(30)
     assert model.knowledge.mean.tolist() == [19.5] * 3, "of 10 to 29"
 

@@ -1,0 +1,135 @@
+"""An update as one CUDA graph: launched as a whole, and not operation by operation."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import TypeAlias
+
+import torch as th
+
+from sb3_htr.common.packed import Packed, map_tensors, tensors_of
+from sb3_htr.common.type_aliases import MultiTaskSamples
+
+# Posterior means, and what to log by its name
+Outcome: TypeAlias = tuple[th.Tensor, dict[str, th.Tensor]]
+# What learns from a meta-batch; whether target networks follow
+Learn: TypeAlias = Callable[[MultiTaskSamples, bool], Outcome]
+
+
+class FixedUpdate:
+    """
+    An update whose meta-batches are in the same memory each time, where one copy brings them.
+
+    :param learn: an update; it waits for no value that it computes
+    :param device: of the networks
+    """
+
+    def __init__(self, learn: Learn, device: th.device) -> None:
+        self._learn, self._device = learn, device
+        self._memory: Packed | None = None
+
+    def __call__(self, data: MultiTaskSamples, update_target: bool) -> Outcome:
+        """
+        :param data: of the same shapes each time, on the CPU
+        :param update_target: whether target networks follow
+        :return: posterior means and what to log, as ``learn`` returns it
+        """
+        given = tensors_of(data)
+        if self._memory is None:
+            self._memory = Packed(given, self._device)
+            views = iter(self._memory.tensors)
+            self._data = map_tensors(lambda _: next(views), data)
+        # Other memory each time, which is given back when it was read: nothing waits for the copy
+        host = Packed(given, "cpu", pin_memory=self._device.type == "cuda")
+        for own, tensor in zip(host.tensors, given, strict=True):
+            own.copy_(tensor)
+        self._memory.block.copy_(host.block, non_blocking=True)
+        return self._run(update_target)
+
+    def _run(self, update_target: bool) -> Outcome:
+        return self._learn(self._data, update_target)
+
+
+class GraphedUpdate(FixedUpdate):
+    """
+    The same, captured as a CUDA graph and replayed.
+
+    A graph has settings, learning rates among them, as constants, so it is made anew in each call of ``train``. The first
+    update is one as any other, in which libraries and optimizers make what they need.
+
+    :param learn: an update; it waits for no value that it computes
+    :param device: of the networks, a GPU
+    :param optimizers: of what learns
+    """
+
+    def __init__(self, learn: Learn, device: th.device, optimizers: Sequence[th.optim.Optimizer]) -> None:
+        super().__init__(learn, device)
+        self._optimizers = optimizers
+        self._is_first = True
+        self._replays: dict[bool, Callable[[], None]] = {}
+        self._outcomes: dict[bool, tuple[th.Tensor, list[str], th.Tensor]] = {}
+
+    def _run(self, update_target: bool) -> Outcome:
+        if self._is_first:
+            self._is_first = False
+            return aside(partial(super()._run, update_target), self._device)
+        if update_target not in self._replays:
+            with capturable(self._optimizers):
+                self._replays[update_target] = capture(partial(self._record, update_target), self._device)
+        self._replays[update_target]()
+        # The next replay overwrites it
+        mean, names, log = self._outcomes[update_target]
+        return mean.clone(), dict(zip(names, log.clone(), strict=True))
+
+    def _record(self, update_target: bool) -> None:
+        mean, log = super()._run(update_target)
+        self._outcomes[update_target] = mean, list(log), th.stack([*log.values()])
+
+
+def capture(function: Callable[[], None], device: th.device) -> Callable[[], None]:
+    """
+    :param function: what it asks of the GPU is recorded, and not done
+    :param device: the GPU
+    :return: does it
+    """
+    graph = th.cuda.CUDAGraph()
+    with th.cuda.device(device), th.cuda.graph(graph, stream=th.cuda.Stream(device)):
+        function()
+    return graph.replay
+
+
+def aside(function: Callable[[], Outcome], device: th.device) -> Outcome:
+    """
+    :param function: done on a stream of its own, as torch asks of what comes before a capture
+    :param device: the GPU
+    :return: what it returns
+    """
+    stream = th.cuda.Stream(device)
+    stream.wait_stream(th.cuda.current_stream(device))
+    with th.cuda.stream(stream):
+        result = function()
+    th.cuda.current_stream(device).wait_stream(stream)
+    return result
+
+
+@contextmanager
+def capturable(optimizers: Sequence[th.optim.Optimizer]) -> Iterator[None]:
+    """
+    Within, Adam can be captured: it counts its steps on the GPU. Files say nothing of it, for they may be read where there is
+    no GPU.
+
+    :param optimizers: have made a step before
+    """
+    groups = [group for optimizer in optimizers for group in optimizer.param_groups if "capturable" in group]
+    before = [group["capturable"] for group in groups]
+    for optimizer in optimizers:
+        for parameter, state in optimizer.state.items():
+            if "step" in state:
+                state["step"] = th.as_tensor(state["step"], device=parameter.device)
+    for group in groups:
+        group["capturable"] = True
+    try:
+        yield
+    finally:
+        for group, value in zip(groups, before, strict=True):
+            group["capturable"] = value

@@ -1,0 +1,182 @@
+"""Updates on meta-batches of one shape, in the same memory each time, and recorded once."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+import torch as th
+from hypothesis import given
+from hypothesis import strategies as st
+
+from helpers import ROLLOUT, MakePEARL, parameters
+from helpers.recording import capture
+from sb3_htr import PEARL
+from sb3_htr.common.packed import Packed, tensors_of
+from sb3_htr.common.type_aliases import MultiTaskSamples
+from sb3_htr.pearl import graphed_update
+from sb3_htr.pearl.graphed_update import FixedUpdate, GraphedUpdate, capturable
+from sb3_htr.pearl.padding import padded
+
+SETTINGS: dict[str, Any] = {
+    "meta_batch_size": 6,
+    "context_size": 9,
+    "batch_size": 5,
+    "ent_coef": "auto_0.3",
+    "n_steps": 2,
+    "learning_starts": 10**9,
+    "target_update_interval": 2,
+}
+
+
+def uneven(model: PEARL) -> Callable[..., MultiTaskSamples]:
+    """``sample`` of the model, with tasks that have other numbers of rows each time, as where episodes end early."""
+    assert model.replay_buffer is not None
+    sample, rng = model.replay_buffer.sample, np.random.default_rng(0)
+
+    def cut(*args: Any, **sizes: Any) -> MultiTaskSamples:
+        data = sample(*args, **sizes)
+        labels, n = data.labels, len(data.rewards)
+        keep = np.sort(rng.choice(n, size=int(rng.integers(n // 2, n)), replace=False))
+        keep = np.union1d(keep, np.cumsum(data.lengths.numpy()) - 1)  # one of each task
+        task = np.repeat(np.arange(len(data.lengths)), data.lengths)
+        rows = ("observations", "actions", "next_observations", "rewards", "dones", "discounts")
+        data = data._replace(
+            **{name: getattr(data, name)[keep] for name in rows}, lengths=th.from_numpy(np.bincount(task[keep]))
+        )
+        assert labels is not None
+        n_labelled = int(rng.integers(3, len(keep)))
+        few = {name: getattr(labels, name)[:n_labelled] for name in ("next_observations", "reward", "task_free")}
+        weights = th.full((n_labelled,), 1 / n_labelled)
+        return data._replace(labels=labels._replace(**few, rows=th.arange(n_labelled), weights=weights))
+
+    return cut
+
+
+@pytest.fixture
+def pair(tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch) -> tuple[PEARL, PEARL]:
+    """
+    Models alike with the same experience, the second of which fills its meta-batches up. Noise is a number: of what is drawn,
+    more rows get other numbers.
+    """
+    models = [tiny_pearl(**SETTINGS, cuda_graph=graph) for graph in (False, True)]
+    for model in models:
+        with pytest.warns(UserWarning, match="Nothing was learnt"):
+            model.learn(2 * ROLLOUT)
+        monkeypatch.setattr(model.replay_buffer, "sample", uneven(model))
+    monkeypatch.setattr(th, "randn_like", lambda tensor: th.full_like(tensor, 0.4))
+    return models[0], models[1]
+
+
+def graphed(model: PEARL) -> GraphedUpdate:
+    """Its update, recorded."""
+    optimizers = [network.optimizer for network in (model.actor, model.critic, model.encoder, model.reward_model)]
+    assert model.ent_coef_optimizer is not None
+    return GraphedUpdate(model._learn, model.device, [*optimizers, model.ent_coef_optimizer])
+
+
+@contextmanager
+def fused(optimizers: Sequence[th.optim.Optimizer]) -> Iterator[None]:
+    """On a CPU, Adam counts its steps in memory if it is fused."""
+    for optimizer in optimizers:
+        optimizer.param_groups[0]["fused"] = True
+    yield
+
+
+@pytest.mark.parametrize("is_recorded", [False, True], ids=["filled up", "recorded and repeated"])
+def test_losses_of_a_hundred_updates_are_the_same(
+    pair: tuple[PEARL, PEARL], is_recorded: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = Mock(side_effect=capture)
+    monkeypatch.setattr(graphed_update, "capture", recording)
+    monkeypatch.setattr(graphed_update, "aside", lambda function, device: function())
+    monkeypatch.setattr(graphed_update, "capturable", fused)
+    eager, fixed = pair
+    learn = graphed(fixed) if is_recorded else FixedUpdate(fixed._learn, fixed.device)
+    for _ in range(100):
+        (mean, log), (own_mean, own_log) = eager._update(5), fixed._update(5, learn)
+        assert list(own_log) == list(log)
+        for name, value in log.items():
+            th.testing.assert_close(own_log[name], value, rtol=1e-5, atol=1e-5, msg=partial("{}: {}".format, name))
+        th.testing.assert_close(own_mean, mean, rtol=1e-5, atol=1e-5)
+    assert log["relabelled_fraction"] > 0 and fixed.reward_model.scale > 0
+    assert recording.call_count == 2 * is_recorded, "with and without the target critics"
+    for pair_of_weights in zip(eager.critic_target.parameters(), fixed.critic_target.parameters(), strict=True):
+        th.testing.assert_close(*pair_of_weights, rtol=1e-4, atol=1e-5)
+
+
+def test_what_a_recording_repeats_is_what_it_saw() -> None:
+    """So the test before finds what is a constant of a recording, and should not be."""
+    x, y, count = th.zeros(3), th.zeros(3), [0]
+
+    def function() -> None:
+        count[0] += 1
+        y.add_(x * count[0])
+
+    replay = capture(function, th.device("cpu"))
+    assert not y.any()
+    x.fill_(2.0)
+    replay()
+    x.fill_(3.0)
+    replay()
+    assert y.tolist() == [5.0] * 3 and count == [1]
+
+
+def test_training_with_filled_meta_batches_learns_and_is_saved(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    model = tiny_pearl(cuda_graph=True, meta_batch_size=64)  # 256 rows and more have labels
+    before = parameters(model)
+    model.learn(2 * ROLLOUT)
+    after = parameters(model)
+    assert model._n_updates == 6
+    for network in ("actor.", "critic.", "critic_target.", "encoder.", "reward_model.", "knowledge."):
+        assert any(not th.equal(before[name], after[name]) for name in before if name.startswith(network)), network
+    model.save(tmp_path / "model")
+    loaded = PEARL.load(tmp_path / "model", env=model.get_env(), device="cpu")
+    assert loaded.cuda_graph
+
+
+@given(shapes=st.lists(st.lists(st.integers(0, 5), max_size=3), max_size=6), seed=st.integers(0, 99))
+def test_packed_tensors_are_those_that_came(shapes: list[list[int]], seed: int) -> None:
+    generator = th.Generator().manual_seed(seed)
+    dtypes = (th.float32, th.int64, th.bool, th.float64)
+    tensors = [th.randint(0, 2, shape, generator=generator).to(dtypes[i % 4]) for i, shape in enumerate(shapes)]
+    here, there = Packed(tensors, "cpu"), Packed(tensors, "cpu")
+    for own, tensor in zip(here.tensors, tensors, strict=True):
+        own.copy_(tensor)
+    there.block.copy_(here.block)
+    for own, tensor in zip(there.tensors, tensors, strict=True):
+        assert own.dtype == tensor.dtype and own.shape == tensor.shape and th.equal(own, tensor)
+        assert own.data_ptr() % own.element_size() == 0 and own.is_contiguous()
+
+
+def test_filling_a_meta_batch_changes_none_of_its_rows(tiny_pearl: MakePEARL) -> None:
+    with pytest.warns(UserWarning, match="Nothing was learnt"):
+        model = tiny_pearl(**SETTINGS).learn(2 * ROLLOUT)
+    assert model.replay_buffer is not None
+    data = uneven(model)(5, meta_batch_size=6, context_size=9, n_labelled=256)
+    full = padded(data, 6 * 9 + 1, 6 * 5 + 1, 30)
+    assert full.lengths.sum() == 31 and full.context.lengths.sum() == 55 and len(full.lengths) == 7
+    assert full.task_weights.sum() == pytest.approx(1.0) and full.task_weights[-1] == 0
+    for own, before in zip(tensors_of(full), tensors_of(data), strict=True):
+        part = own[tuple(slice(n) for n in before.shape)]
+        assert th.equal(part, before)
+        rest = own.clone()
+        rest[tuple(slice(n) for n in before.shape)] = 0
+        assert own is full.lengths or own is full.context.lengths or not rest.any()
+    with pytest.raises(AssertionError):
+        padded(data, 6 * 9 + 1, len(data.rewards) - 1, 30)
+
+
+def test_adam_counts_its_steps_on_the_gpu_while_it_is_captured_and_files_do_not_know() -> None:
+    parameter = th.nn.Parameter(th.ones(2))
+    adam, sgd = th.optim.Adam([parameter]), th.optim.SGD([parameter], 0.1)
+    parameter.grad = th.ones(2)
+    adam.step()
+    with pytest.raises(KeyboardInterrupt), capturable([adam, sgd]):
+        assert adam.param_groups[0]["capturable"] and "capturable" not in sgd.param_groups[0]
+        raise KeyboardInterrupt
+    assert not adam.param_groups[0]["capturable"] and isinstance(adam.state[parameter]["step"], th.Tensor)
