@@ -28,7 +28,8 @@ class ContextEncoder(nn.Module):
     factors' precisions and that of their precisions times means, (n_tasks, 2 * latent_dim).
 
     An encoder of another kind has the same three methods, see :class:`sb3_htr.adaptation.policy.Encoder`, and the same
-    constructor: ``policy_kwargs={"encoder_class": MyEncoder}``.
+    constructor: ``policy_kwargs={"encoder_class": MyEncoder}``. For ``cuda_graph``, it waits for no value that it computes,
+    such as the longest of the lengths, and is finite for rows of zeros.
 
     :param context_dim: length of a context row, obs_dim + action_dim + 1
     :param latent_dim: dimension of z

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
 from typing import TypeAlias
 
 import torch as th
@@ -35,6 +35,7 @@ class FixedUpdate:
         :return: posterior means and what to log, as ``learn`` returns it
         """
         given = tensors_of(data)
+        assert self._memory is None or [t.shape for t in given] == [t.shape for t in self._memory.tensors]
         if self._memory is None:
             self._memory = Packed(given, self._device)
             views = iter(self._memory.tensors)
@@ -86,6 +87,15 @@ class GraphedUpdate(FixedUpdate):
         self._outcomes[update_target] = mean, list(log), th.stack([*log.values()])
 
 
+@cache
+def side_stream(device: th.device) -> th.cuda.Stream:
+    """
+    :param device: a GPU
+    :return: the same each time: torch keeps memory for the matrix products of each stream
+    """
+    return th.cuda.Stream(device)
+
+
 def capture(function: Callable[[], None], device: th.device) -> Callable[[], None]:
     """
     :param function: what it asks of the GPU is recorded, and not done
@@ -93,18 +103,18 @@ def capture(function: Callable[[], None], device: th.device) -> Callable[[], Non
     :return: does it
     """
     graph = th.cuda.CUDAGraph()
-    with th.cuda.device(device), th.cuda.graph(graph, stream=th.cuda.Stream(device)):
+    with th.cuda.device(device), th.cuda.graph(graph, stream=side_stream(device)):
         function()
     return graph.replay
 
 
 def aside(function: Callable[[], Outcome], device: th.device) -> Outcome:
     """
-    :param function: done on a stream of its own, as torch asks of what comes before a capture
+    :param function: done beside the current stream, as torch asks of what comes before a capture
     :param device: the GPU
     :return: what it returns
     """
-    stream = th.cuda.Stream(device)
+    stream = side_stream(device)
     stream.wait_stream(th.cuda.current_stream(device))
     with th.cuda.stream(stream):
         result = function()
@@ -115,17 +125,22 @@ def aside(function: Callable[[], Outcome], device: th.device) -> Outcome:
 @contextmanager
 def capturable(optimizers: Sequence[th.optim.Optimizer]) -> Iterator[None]:
     """
-    Within, Adam can be captured: it counts its steps on the GPU. Files say nothing of it, for they may be read where there is
-    no GPU.
+    Within, optimizers can be captured: all of their state, as Adam's count of steps, is where the parameters are. Files say
+    nothing of it, for they may be read where there is no GPU.
 
     :param optimizers: have made a step before
+    :raises ValueError: for one that counts steps on the CPU
     """
-    groups = [group for optimizer in optimizers for group in optimizer.param_groups if "capturable" in group]
-    before = [group["capturable"] for group in groups]
     for optimizer in optimizers:
         for parameter, state in optimizer.state.items():
-            if "step" in state:
-                state["step"] = th.as_tensor(state["step"], device=parameter.device)
+            if "step" in state and any("capturable" not in group for group in optimizer.param_groups):
+                raise ValueError(
+                    f"{type(optimizer).__name__} cannot be captured as a CUDA graph: take Adam or AdamW as optimizer_class, "
+                    "or cuda_graph=False."
+                )
+            state.update((k, v.to(parameter.device)) for k, v in state.items() if isinstance(v, th.Tensor))
+    groups = [group for optimizer in optimizers for group in optimizer.param_groups if "capturable" in group]
+    before = [group["capturable"] for group in groups]
     for group in groups:
         group["capturable"] = True
     try:

@@ -7,10 +7,8 @@ import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import LinearSchedule
-from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.explorers import Explorer
-from sb3_htr.adaptation.task_bank import TaskBank
 from sb3_htr.common.matmul import PRECISIONS, matmul_precision
 from sb3_htr.common.settings import check_flags, check_numbers
 from sb3_htr.common.type_aliases import MultiTaskSamples, RewardLabels
@@ -85,8 +83,8 @@ class PEARL(OffPolicyMetaAlgorithm):
     :param train_explorer: the same for rollouts
     :param matmul_precision: of matrix products in updates, as for ``torch.set_float32_matmul_precision``. ``"medium"`` rounds
         their factors to bfloat16, which is faster where the processor has such products (docs/performance.md)
-    :param cuda_graph: an update is one CUDA graph, for meta-batches that are filled up to ``batch_size`` and ``context_size``
-        rows of each task. On a CPU they are filled up alike, and the update is what it always is
+    :param cuda_graph: an update is one CUDA graph, for meta-batches that one task more, without a weight, fills up to as many
+        rows as there can be (docs/performance.md). On a CPU they are filled up alike, and nothing is captured
     :param stats_window_size: episodes over which logged returns are averaged
     :param tensorboard_log: folder for TensorBoard, none by default
     :param policy_kwargs: arguments of the policy: ``latent_dim``, ``net_arch``, ``encoder_arch`` (paper: 5, 3x300, 3x200),
@@ -204,13 +202,6 @@ class PEARL(OffPolicyMetaAlgorithm):
             raise ValueError(f"matmul_precision is {self.matmul_precision!r}, expected one of {list(PRECISIONS)}.")
         super()._setup_model()
 
-    def _make_replay(self, env: VecEnv) -> tuple[MultiTaskReplayBuffer, TaskBank]:
-        replay_buffer, task_bank = super()._make_replay(env)
-        if self.cuda_graph:
-            # Where a meta-batch is filled up, and from where one copy brings all of it
-            replay_buffer.device = th.device("cpu")
-        return replay_buffer, task_bank
-
     def _create_aliases(self) -> None:
         super()._create_aliases()
         self.encoder = self.policy.encoder
@@ -230,6 +221,8 @@ class PEARL(OffPolicyMetaAlgorithm):
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
         learn = self._fixed_update(optimizers) if self.cuda_graph else None
+        # Meta-batches are filled up on the CPU, from where one copy brings all of it
+        self.replay_buffer.device = th.device("cpu") if self.cuda_graph else self.device
         with matmul_precision(self.matmul_precision):
             means, logs = zip(*(self._update(batch_size, learn) for _ in range(gradient_steps)), strict=True)
         log_means = {key: th.stack([log[key] for log in logs]).mean().item() for key in logs[0]}

@@ -171,7 +171,7 @@ def test_filling_a_meta_batch_changes_none_of_its_rows(tiny_pearl: MakePEARL) ->
         padded(data, 6 * 9 + 1, len(data.rewards) - 1, 30)
 
 
-def test_adam_counts_its_steps_on_the_gpu_while_it_is_captured_and_files_do_not_know() -> None:
+def test_adam_is_capturable_while_it_is_captured_and_files_do_not_know() -> None:
     parameter = th.nn.Parameter(th.ones(2))
     adam, sgd = th.optim.Adam([parameter]), th.optim.SGD([parameter], 0.1)
     parameter.grad = th.ones(2)
@@ -179,4 +179,11 @@ def test_adam_counts_its_steps_on_the_gpu_while_it_is_captured_and_files_do_not_
     with pytest.raises(KeyboardInterrupt), capturable([adam, sgd]):
         assert adam.param_groups[0]["capturable"] and "capturable" not in sgd.param_groups[0]
         raise KeyboardInterrupt
-    assert not adam.param_groups[0]["capturable"] and isinstance(adam.state[parameter]["step"], th.Tensor)
+    assert not adam.param_groups[0]["capturable"] and adam.state[parameter]["step"] == 1
+    adagrad = th.optim.Adagrad([parameter])
+    adagrad.step()
+    with (
+        pytest.raises(ValueError, match="Adagrad cannot be captured as a CUDA graph: take Adam or AdamW"),
+        capturable([adagrad]),
+    ):
+        pass
