@@ -26,6 +26,16 @@ HEADLINES: dict[str, dict[str, tuple[str, ...]]] = {
         "ant_prior": ("htr-ser", "pearl-dense"),
     },
 }
+# What HTR is better than, in the table of differences: methods by their experiments
+COMPARED: dict[str, tuple[str, ...]] = {
+    "point_robot": ("pearl-sparse", "pearl-dense"),
+    "wheeled": ("pearl-sparse", "pearl-dense"),
+    "ant": ("pearl-dense",),
+    "fetch_reach": ("pearl-sparse",),
+    "fetch_push": ("pearl-sparse",),
+    "prior": ("pearl-dense-prior",),
+    "wheeled_prior": ("pearl-dense-prior",),
+}
 EXPLORERS = {
     "belief": {"last_episode_return": "return", "success_rate": "tasks solved", "episodes_to_first_success": "first success"},
     "prior": {"last_episode_return": "return", "success_rate": "tasks solved"},
@@ -134,6 +144,43 @@ def headline(summaries: dict[str, dict[str, Any]], methods_of: dict[str, tuple[s
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
+def differences(summaries: dict[str, dict[str, Any]], methods_of: dict[str, tuple[str, ...]]) -> str:
+    """
+    :param summaries: contents of ``summary.json`` by their names
+    :param methods_of: what their first variant is compared with, where it is there
+    :return: Markdown table, one line per env and method: return of the first variant less that of the method, by explorer and,
+        by the first one, in the last of the other envs that both were tested in; and env steps, as a multiple of its own
+    """
+    explorers = ("belief", "learned-prior", "prior")
+    heads = [f"`{explorer}`" for explorer in explorers]
+    lines = [["env", "less", *heads, f"`{explorers[0]}`, further away", "env steps until solved"]]
+    lines.append(["---"] * len(lines[0]))
+    for name, methods in methods_of.items():
+        summary = summaries.get(name, {"differences": [], "slowdowns": []})
+        for method in methods:
+            rows = [row for row in summary["differences"] if row["variant"] == method]
+            if not rows:
+                continue
+            by_place = {(row["explorer"], _place(row)): _numbers(row, 1) for row in rows}
+            away = [place for explorer, place in by_place if explorer == explorers[0] and place]
+            (slowdown,) = (row for row in summary["slowdowns"] if row["variant"] == method)
+            n_runs = rows[0]["n_seeds"]
+            few = f", {n_runs} run{'s' * (n_runs > 1)}" if n_runs < MIN_RUNS else ""
+            cells = [by_place.get((explorer, ""), "") for explorer in explorers]
+            further = f"{by_place[explorers[0], away[-1]]} ({away[-1]})" if away else ""
+            lines.append([rows[0]["env"], f"`{method}`{few}", *cells, further, _times(slowdown)])
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
+def _times(row: dict[str, Any]) -> str:
+    """How many times as many; runs that never solved enough have no upper limit."""
+    if row["low"] is None:
+        return ""
+    return (
+        f"{row['iqm']:.1f} [{row['low']:.1f}, {row['high']:.1f}]" if row["high"] is not None else f"at least {row['low']:.1f}"
+    )
+
+
 def _interval(row: dict[str, Any]) -> str:
     if row["metric"] == "success_rate":
         return f"{row['iqm']:.0%} [{row['low']:.0%}, {row['high']:.0%}]"
@@ -178,7 +225,8 @@ def tables() -> dict[str, str]:
     summaries = [json.loads(path.read_text()) for path in sorted(Path(RESULTS).glob("*/summary.json"))]
     own = {f"results:{summary['name']}": table(summary) for summary in summaries}
     by_name = {summary["name"]: summary for summary in summaries}
-    return {**own, **{name: headline(by_name, methods_of) for name, methods_of in HEADLINES.items()}}
+    headlines = {name: headline(by_name, methods_of) for name, methods_of in HEADLINES.items()}
+    return {**own, **headlines, "differences": differences(by_name, COMPARED)}
 
 
 def main() -> None:
