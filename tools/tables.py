@@ -26,15 +26,18 @@ HEADLINES: dict[str, dict[str, tuple[str, ...]]] = {
         "ant_prior": ("htr-ser", "pearl-dense"),
     },
 }
-# What HTR is better than, in the table of differences: methods by their experiments
-COMPARED: dict[str, tuple[str, ...]] = {
-    "point_robot": ("pearl-sparse", "pearl-dense"),
-    "wheeled": ("pearl-sparse", "pearl-dense"),
-    "ant": ("pearl-dense",),
-    "fetch_reach": ("pearl-sparse",),
-    "fetch_push": ("pearl-sparse",),
-    "prior": ("pearl-dense-prior",),
-    "wheeled_prior": ("pearl-dense-prior",),
+# What the first variant of experiments is compared with
+COMPARED: dict[str, dict[str, tuple[str, ...]]] = {
+    "differences": {
+        "point_robot": ("pearl-sparse", "pearl-dense"),
+        "wheeled": ("pearl-sparse", "pearl-dense"),
+        "ant": ("pearl-dense",),
+        "fetch_reach": ("pearl-sparse",),
+        "fetch_push": ("pearl-sparse",),
+        "prior": ("pearl-dense-prior",),
+        "wheeled_prior": ("pearl-dense-prior",),
+    },
+    "differences:rivals": {"rivals": ("pearl-dense, tuned", "htr-hipi", "htr-hfr", "rl2", "sac-her")},
 }
 EXPLORERS = {
     "belief": {"last_episode_return": "return", "success_rate": "tasks solved", "episodes_to_first_success": "first success"},
@@ -149,19 +152,18 @@ def differences(summaries: dict[str, dict[str, Any]], methods_of: dict[str, tupl
     :param summaries: contents of ``summary.json`` by their names
     :param methods_of: what their first variant is compared with, where it is there
     :return: Markdown table, one line per env and method: return of the first variant less that of the method, by explorer and,
-        by the first one, in the last of the other envs that both were tested in; and env steps, as a multiple of its own
+        by its first one, in the last of the other envs that both were tested in; and env steps, as a multiple of its own
     """
     explorers = ("belief", "learned-prior", "prior")
-    heads = [f"`{explorer}`" for explorer in explorers]
-    lines = [["env", "less", *heads, f"`{explorers[0]}`, further away", "env steps until solved"]]
-    lines.append(["---"] * len(lines[0]))
+    lines = [["env", "less", *(f"`{explorer}`" for explorer in explorers), "`belief`, further away", "env steps until solved"]]
     for name, methods in methods_of.items():
         summary = summaries.get(name, {"differences": [], "slowdowns": []})
         for method in methods:
             rows = [row for row in summary["differences"] if row["variant"] == method]
             if not rows:
                 continue
-            by_place = {(row["explorer"], _place(row)): _numbers(row, 1) for row in rows}
+            # What explores in a way of its own is compared with the first explorer
+            by_place = {(row["explorer"].replace("own", explorers[0]), _place(row)): _numbers(row, 1) for row in rows}
             away = [place for explorer, place in by_place if explorer == explorers[0] and place]
             (slowdown,) = (row for row in summary["slowdowns"] if row["variant"] == method)
             n_runs = rows[0]["n_seeds"]
@@ -169,7 +171,10 @@ def differences(summaries: dict[str, dict[str, Any]], methods_of: dict[str, tupl
             cells = [by_place.get((explorer, ""), "") for explorer in explorers]
             further = f"{by_place[explorers[0], away[-1]]} ({away[-1]})" if away else ""
             lines.append([rows[0]["env"], f"`{method}`{few}", *cells, further, _times(slowdown)])
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+    # Without columns that say nothing
+    shown = [column for column in zip(*lines, strict=True) if any(column[1:]) or len(lines) == 1]
+    head, *body = zip(*shown, strict=True)
+    return "\n".join("| " + " | ".join(line) + " |" for line in (head, ["---"] * len(head), *body)) + "\n"
 
 
 def _times(row: dict[str, Any]) -> str:
@@ -226,7 +231,7 @@ def tables() -> dict[str, str]:
     own = {f"results:{summary['name']}": table(summary) for summary in summaries}
     by_name = {summary["name"]: summary for summary in summaries}
     headlines = {name: headline(by_name, methods_of) for name, methods_of in HEADLINES.items()}
-    return {**own, **headlines, "differences": differences(by_name, COMPARED)}
+    return {**own, **headlines, **{name: differences(by_name, methods_of) for name, methods_of in COMPARED.items()}}
 
 
 def main() -> None:
