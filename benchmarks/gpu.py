@@ -33,7 +33,7 @@ def main() -> None:
         return
     against, filled, graph = "operation by operation", "operation by operation, filled up and in one copy", "one CUDA graph"
     models = {name: make_model(cuda_graph=name != against, device=device) for name in (against, filled, graph)}
-    models[filled]._fixed_update = lambda _: FixedUpdate(models[filled]._learn, models[filled].device)  # type: ignore
+    models[filled]._fixed_update = lambda _: FixedUpdate(models[filled]._gradient_step, models[filled].device)  # type: ignore
     times = by_turns({name: partial(update_seconds, model) for name, model in models.items()})
     rates = {name: 1 / float(np.median(duration)) for name, duration in times.items()}
     figures = [

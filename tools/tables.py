@@ -7,6 +7,7 @@ from typing import Any
 
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.experiments.protocol import MIN_RUNS
+from sb3_htr.zoo.run.method import OWN
 
 RESULTS = Path(__file__).parents[1] / "results"
 DOCUMENTS = (RESULTS.parent / "README.md", RESULTS.parent / "docs" / "results.md", RESULTS.parent / "docs" / "performance.md")
@@ -163,7 +164,9 @@ def differences(summaries: dict[str, dict[str, Any]], methods_of: dict[str, tupl
             if not rows:
                 continue
             # What explores in a way of its own is compared with the first explorer
-            by_place = {(row["explorer"].replace("own", explorers[0]), _place(row)): _numbers(row, 1) for row in rows}
+            by_place = {
+                (explorers[0] if row["explorer"] == OWN else row["explorer"], _place(row)): _numbers(row, 1) for row in rows
+            }
             away = [place for explorer, place in by_place if explorer == explorers[0] and place]
             (slowdown,) = (row for row in summary["slowdowns"] if row["variant"] == method)
             n_runs = rows[0]["n_seeds"]

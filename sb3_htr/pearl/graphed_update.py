@@ -12,27 +12,27 @@ from sb3_htr.common.type_aliases import MultiTaskSamples
 
 # Posterior means, and what to log by its name
 Outcome: TypeAlias = tuple[th.Tensor, dict[str, th.Tensor]]
-# What learns from a meta-batch; whether target networks follow
-Learn: TypeAlias = Callable[[MultiTaskSamples, bool], Outcome]
+# Learns from a meta-batch; whether target networks follow
+GradientStep: TypeAlias = Callable[[MultiTaskSamples, bool], Outcome]
 
 
 class FixedUpdate:
     """
     An update whose meta-batches are in the same memory each time, where one copy brings them.
 
-    :param learn: an update; it waits for no value that it computes
+    :param gradient_step: of all networks; it waits for no value that it computes
     :param device: of the networks
     """
 
-    def __init__(self, learn: Learn, device: th.device) -> None:
-        self._learn, self._device = learn, device
+    def __init__(self, gradient_step: GradientStep, device: th.device) -> None:
+        self._gradient_step, self._device = gradient_step, device
         self._memory: Packed | None = None
 
     def __call__(self, data: MultiTaskSamples, update_target: bool) -> Outcome:
         """
         :param data: of the same shapes each time, on the CPU
         :param update_target: whether target networks follow
-        :return: posterior means and what to log, as ``learn`` returns it
+        :return: posterior means and what to log, as ``gradient_step`` returns them
         """
         given = tensors_of(data)
         assert self._memory is None or [t.shape for t in given] == [t.shape for t in self._memory.tensors]
@@ -48,7 +48,7 @@ class FixedUpdate:
         return self._run(update_target)
 
     def _run(self, update_target: bool) -> Outcome:
-        return self._learn(self._data, update_target)
+        return self._gradient_step(self._data, update_target)
 
 
 class GraphedUpdate(FixedUpdate):
@@ -58,13 +58,13 @@ class GraphedUpdate(FixedUpdate):
     A graph has settings, learning rates among them, as constants, so it is made anew in each call of ``train``. The first
     update is one as any other, in which libraries and optimizers make what they need.
 
-    :param learn: an update; it waits for no value that it computes
+    :param gradient_step: of all networks; it waits for no value that it computes
     :param device: of the networks, a GPU
     :param optimizers: of what learns
     """
 
-    def __init__(self, learn: Learn, device: th.device, optimizers: Sequence[th.optim.Optimizer]) -> None:
-        super().__init__(learn, device)
+    def __init__(self, gradient_step: GradientStep, device: th.device, optimizers: Sequence[th.optim.Optimizer]) -> None:
+        super().__init__(gradient_step, device)
         self._optimizers = optimizers
         self._is_first = True
         self._replays: dict[bool, Callable[[], None]] = {}

@@ -220,11 +220,11 @@ class PEARL(OffPolicyMetaAlgorithm):
         if self.ent_coef_optimizer is not None:
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
-        learn = self._fixed_update(optimizers) if self.cuda_graph else None
+        fixed = self._fixed_update(optimizers) if self.cuda_graph else None
         # Meta-batches are filled up on the CPU, from where one copy brings all of it
         self.replay_buffer.device = th.device("cpu") if self.cuda_graph else self.device
         with matmul_precision(self.matmul_precision):
-            means, logs = zip(*(self._update(batch_size, learn) for _ in range(gradient_steps)), strict=True)
+            means, logs = zip(*(self._update(batch_size, fixed) for _ in range(gradient_steps)), strict=True)
         log_means = {key: th.stack([log[key] for log in logs]).mean().item() for key in logs[0]}
         check_finite(self.policy, log_means, self._n_updates, self.num_timesteps)
         self._posterior_watch.check(log_means["kl_divergence"])
@@ -245,15 +245,15 @@ class PEARL(OffPolicyMetaAlgorithm):
 
     def _fixed_update(self, optimizers: list[th.optim.Optimizer]) -> FixedUpdate:
         if self.device.type == "cuda":
-            return GraphedUpdate(self._learn, self.device, optimizers)
-        return FixedUpdate(self._learn, self.device)
+            return GraphedUpdate(self._gradient_step, self.device, optimizers)
+        return FixedUpdate(self._gradient_step, self.device)
 
-    def _update(self, batch_size: int, learn: FixedUpdate | None = None) -> Outcome:
+    def _update(self, batch_size: int, fixed: FixedUpdate | None = None) -> Outcome:
         """
         One update of all networks.
 
         :param batch_size: transitions per task for actor and critics
-        :param learn: what learns from a meta-batch that is filled up
+        :param fixed: makes it, of a meta-batch that is filled up
         :return: posterior means (M, latent_dim), and what to log
         """
         assert self.replay_buffer is not None
@@ -267,19 +267,19 @@ class PEARL(OffPolicyMetaAlgorithm):
         )
         self._n_updates += 1
         update_target = self._n_updates % self.target_update_interval == 0
-        if learn is None:
-            mean, log = self._learn(data, update_target)
+        if fixed is None:
+            mean, log = self._gradient_step(data, update_target)
         else:
             n = self.meta_batch_size
             sizes = n * self.context_size + 1, n * batch_size + 1, min(N_LABELLED, n * batch_size)
-            mean, log = learn(padded(data, *sizes), update_target)
+            mean, log = fixed(padded(data, *sizes), update_target)
         log["relabelled_fraction"] = th.tensor(data.relabelled.mean())
         log["rl_zero_reward_fraction"] = th.tensor(data.unrewarded.mean())
         for listener in self.update_listeners:
             listener()
         return mean[: self.meta_batch_size], log
 
-    def _learn(self, data: MultiTaskSamples, update_target: bool) -> Outcome:
+    def _gradient_step(self, data: MultiTaskSamples, update_target: bool) -> Outcome:
         """The part of an update that a GPU does, and that can be captured: it waits for no value."""
         # Each task has the same weight in a mean over transitions
         weight = (data.task_weights / data.lengths).repeat_interleave(data.lengths, output_size=len(data.rewards))

@@ -76,7 +76,7 @@ def graphed(model: PEARL) -> GraphedUpdate:
     """Its update, recorded."""
     optimizers = [network.optimizer for network in (model.actor, model.critic, model.encoder, model.reward_model)]
     assert model.ent_coef_optimizer is not None
-    return GraphedUpdate(model._learn, model.device, [*optimizers, model.ent_coef_optimizer])
+    return GraphedUpdate(model._gradient_step, model.device, [*optimizers, model.ent_coef_optimizer])
 
 
 @contextmanager
@@ -96,7 +96,7 @@ def test_losses_of_a_hundred_updates_are_the_same(
     monkeypatch.setattr(graphed_update, "aside", lambda function, device: function())
     monkeypatch.setattr(graphed_update, "capturable", fused)
     eager, fixed = pair
-    learn = graphed(fixed) if is_recorded else FixedUpdate(fixed._learn, fixed.device)
+    learn = graphed(fixed) if is_recorded else FixedUpdate(fixed._gradient_step, fixed.device)
     for _ in range(100):
         (mean, log), (own_mean, own_log) = eager._update(5), fixed._update(5, learn)
         assert list(own_log) == list(log)
