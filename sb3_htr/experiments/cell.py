@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -101,14 +102,21 @@ class Cell:
         :param path: raw results; those of older versions say less of what they are of, or nothing
         :raises ValueError: if they are of something else
         """
-        raw = load_arrays(path, advice=REMOVE)
+        advice = "move it away with its run, or choose other --runs."
+        self.check_facts(load_arrays(path, advice=REMOVE), str(path), advice)
+
+    def check_facts(self, raw: Mapping[str, Any], what: str, advice: str) -> None:
+        """
+        :param raw: raw results
+        :param what: they are, for the message
+        :param advice: what to do if they are of something else, likewise
+        :raises ValueError: if they are
+        """
         given, own = json.loads(str(raw["cell"])) if "cell" in raw else {}, json.loads(self.facts())
         if different := [name for name, value in given.items() if value != own.get(name)]:
             name = different[0]
-            raise ValueError(
-                f"{path} has {name} {given[name]!r}, but {self.experiment}/{self.name} needs {own.get(name)!r}: move it away "
-                "with its run, or choose other --runs."
-            )
+            needs = f"{self.experiment}/{self.name} needs {own.get(name)!r}"
+            raise ValueError(f"{what} has {name} {given[name]!r}, but {needs}: {advice}")
 
     def training(self, folder: Path) -> list[str]:
         """

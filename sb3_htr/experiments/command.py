@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sb3_htr.common.settings import check_numbers
-from sb3_htr.experiments import driver, executors, grid, report
+from sb3_htr.experiments import driver, executors, grid, raw_results, report
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.zoo.commands.arguments import OF_PACKAGES, make_parser
 from sb3_htr.zoo.run.trust import import_packages
@@ -15,7 +15,9 @@ from sb3_htr.zoo.run.trust import import_packages
 EXAMPLE = """  sb3-htr experiment point_robot --jobs 2
   sb3-htr experiment ant --quick                        one seed, a tenth of the env steps: does it run?
   sb3-htr experiment ant --ray auto --runs /shared/runs      on a Ray cluster
-  sb3-htr experiment ant --finished                     tables and pictures, of what has been run so far"""
+  sb3-htr experiment ant --finished                     tables and pictures, of what has been run so far
+  sb3-htr experiment mine --gym-packages my_method --with-results results/rivals
+                                                        beside runs that were made before, which are not trained again"""
 
 
 def main(argv: Sequence[str]) -> None:
@@ -34,6 +36,8 @@ def main(argv: Sequence[str]) -> None:
     runs = "folder for the runs; those of an experiment resume from RUNS/NAME (default: runs)"
     parser.add_argument("--runs", type=Path, default=Path("runs"), help=runs)
     parser.add_argument("-o", "--output", type=Path, help="folder for the results (default: results/NAME)")
+    earlier = "folders of results: runs that they have are finished, and not trained again"
+    parser.add_argument("--with-results", type=Path, nargs="+", default=[], metavar="FOLDER", help=earlier)
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--jobs", type=int, default=2, help="runs at a time, each on one thread (default: 2)")
     where.add_argument("--ray", metavar="ADDRESS", help="run on a Ray cluster; auto for the one of this machine")
@@ -51,9 +55,14 @@ def main(argv: Sequence[str]) -> None:
         raise ValueError(f"--cell is {args.cell}, expected 0 to {len(cells) - 1}: the experiment has {len(cells)} runs.")
     quick = "quick-" if args.quick else ""
     runs = (args.runs / "quick" if args.quick else args.runs).resolve()
+    output = args.output or Path("results", quick + args.name)
+    for folder in args.with_results:
+        print(f"{raw_results.unpack(folder, cells, runs)} of {len(cells)} runs are in {folder}.")
     chosen = cells if args.cell is None else [cells[args.cell]]
     report.check(finished(chosen, runs))
     if not args.finished:
+        if args.cell is None:
+            raw_results.check_none_lost(output, cells)
         here = executors.Here() if args.cell is not None else executors.Processes(args.jobs)
         try:
             driver.Driver(chosen, runs, executors.Ray(args.ray) if args.ray else here).run()
@@ -66,7 +75,6 @@ def main(argv: Sequence[str]) -> None:
     if not results:
         raise ValueError(f"No run of {args.name} is finished in {runs}: run it without --finished, or name other --runs.")
     print(f"{len(results)} of {len(cells)} runs are finished.")
-    output = args.output or Path("results", quick + args.name)
     how = ("--quick " if args.quick else "") + f"--seeds {len({cell.seed for cell in cells})}"
     how += f" --gym-packages {' '.join(packages)}" if packages else ""
     report.write(f"sb3-htr experiment {args.name} {how}", experiment, results, output)

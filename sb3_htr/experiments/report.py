@@ -10,9 +10,9 @@ import numpy as np
 
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.experiments import figures
+from sb3_htr.experiments import figures, raw_results
 from sb3_htr.experiments.calibration import expected_calibration_error
-from sb3_htr.experiments.cell import REMOVE, Cell, Evaluation
+from sb3_htr.experiments.cell import Cell, Evaluation
 from sb3_htr.experiments.grid import Experiment
 from sb3_htr.experiments.protocol import EVAL_SEEDS, METRICS, TIMES, env_steps_to_solved, is_solved, scores
 from sb3_htr.experiments.runner import LOGGED
@@ -20,10 +20,6 @@ from sb3_htr.zoo.plots.intervals import iqm_difference, iqm_interval
 
 RETURN = "last_episode_return"
 STEPS = env_steps_to_solved.__name__
-# What a report is made of
-NEEDED = ("timesteps", "curve", "solved", "elapsed_s", "calibration")
-# Of the code that trained, and of that which evaluated
-COMMITS = ("commit", "evaluation_commit")
 
 
 class Runs(NamedTuple):
@@ -83,7 +79,7 @@ def summarize(command: str, results: dict[Cell, Path]) -> dict[str, Any]:
     return {
         "name": next(iter(results)).experiment,
         "command": command,
-        **{key: ", ".join(sorted({str(raw[key]) for runs in all_runs for raw in runs.raws})) for key in COMMITS},
+        **{key: ", ".join(sorted({str(raw[key]) for runs in all_runs for raw in runs.raws})) for key in raw_results.COMMITS},
         "date": date.today().isoformat(),
         "machine": ", ".join(
             sorted({str(raw.get("machine", "a machine that was not recorded")) for runs in all_runs for raw in runs.raws})
@@ -152,11 +148,8 @@ def check(results: dict[Cell, Path]) -> None:
     """
     trained_by: dict[tuple[str, str], tuple[Path, dict[str, Any]]] = {}
     for cell, path in results.items():
-        cell.check_result(path)
-        returns = (f"returns_{evaluation.name}" for evaluation in cell.evaluations)
-        raw = load_arrays(path, (*NEEDED, *COMMITS, *LOGGED, *returns), f"It may be of another version. {REMOVE}")
         # Older ones do not say
-        own = json.loads(str(raw.get("hyperparams", "null")))
+        own = json.loads(str(raw_results.load(cell, path).get("hyperparams", "null")))
         first, theirs = trained_by.setdefault((cell.variant, str(cell.env_kwargs)), (path, own))
         if own and theirs and (different := sorted(key for key in {*own, *theirs} if own.get(key) != theirs.get(key))):
             raise ValueError(
@@ -173,20 +166,15 @@ def write(command: str, experiment: Experiment, results: dict[Cell, Path], folde
     :param experiment: draws the picture
     :param results: raw results of its cells
     :param folder: where they go
-    :raises ValueError: if a result lacks something; nothing is written then
+    :raises ValueError: if a result lacks something, or runs that are in the folder would be lost; nothing is written then
     """
     check(results)
+    raw_results.check_none_lost(folder, [*results])
     # Of what is finished, too, the first variant is what the others are compared with
     variants = [variant.name or variant.method for variant in experiment.variants]
     results = dict(sorted(results.items(), key=lambda result: variants.index(result[0].variant)))
     folder.mkdir(parents=True, exist_ok=True)
-    # Of all methods together it may be some megabytes
-    raw: dict[str, dict[str, Any]] = {}
-    for cell, result in results.items():
-        raw.setdefault(cell.method, {}).update({f"{cell.name}/{key}": value for key, value in load_arrays(result).items()})
-    for method, arrays in raw.items():
-        with atomic_path(folder / f"raw-{method}.npz") as path:
-            np.savez_compressed(path, **arrays)
+    raw_results.pack(results, folder)
     with atomic_path(folder / "summary.json") as path:
         path.write_text(json.dumps(summarize(command, results), indent=1) + "\n")
     experiment.figure(results, folder / f"{experiment.name}.png")

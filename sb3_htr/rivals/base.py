@@ -118,7 +118,7 @@ class FreshStart(BaseCallback):
 class Rival(CheckedFiles, Resumable):
     """
     A mixin for algorithms of Stable-Baselines3. It is made as :class:`sb3_htr.PEARL` is: of a policy and an env of a task
-    family. What the algorithm needs around the env is put there by its ``_wrap_env``.
+    family. What the algorithm needs around the env is put there by its ``_wrap_env``, see :attr:`WRAPPERS`.
 
     A rollout begins with a reset of all envs, as PEARL's do, so that a training that goes on from a checkpoint is the same as
     one that was never interrupted, bit for bit.
@@ -126,6 +126,8 @@ class Rival(CheckedFiles, Resumable):
 
     #: Policy of a file that does not say its own
     DEFAULT_POLICY: ClassVar[str]
+    #: What its ``_wrap_env`` puts around an env, to show the agent more than the env's observations
+    WRAPPERS: ClassVar[tuple[type[VecEnv], ...]] = ()
     #: Settings, whole numbers, that an agent which is loaded to act has of its training, and those that it has in their place
     ACTS_BY: ClassVar[tuple[str, ...]] = ()
     ACTS_WITH: ClassVar[dict[str, Any]] = {}
@@ -167,13 +169,12 @@ class Rival(CheckedFiles, Resumable):
         :raises ValueError: if its spaces are not those of training, it normalizes, or it is what the model trains on
         """
         check_is_not_normalized(env)
-        wrapped = self._wrap_env(env)
-        if wrapped is env:
+        if isinstance(env, self.WRAPPERS):
             raise ValueError(
                 f"This env shows more than its observations, as {type(self).__name__} sees them in training: pass another, "
                 "or its id."
             )
-        check_for_correct_spaces(wrapped, self.observation_space, self.action_space)
+        check_for_correct_spaces(self._wrap_env(env), self.observation_space, self.action_space)
 
     def begin_rollout(self) -> None:
         """Begin new episodes in all envs."""

@@ -84,6 +84,7 @@ class RL2(Rival, RecurrentPPO):
     """
 
     DEFAULT_POLICY: ClassVar[str] = "MlpLstmPolicy"
+    WRAPPERS: ClassVar[tuple[type[VecEnv], ...]] = (TrialVecEnv,)
     ACTS_BY: ClassVar[tuple[str, ...]] = ("n_episodes_per_trial",)
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpLstmPolicy": TrialLstmPolicy}
     FOLLOWS: ClassVar[dict[str, str]] = {"n_steps": "it follows from n_trials_per_rollout, as a rollout is whole trials"}

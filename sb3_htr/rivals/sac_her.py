@@ -151,6 +151,7 @@ class SACHER(Rival, SAC):
 
     DEFAULT_POLICY: ClassVar[str] = "MultiInputPolicy"
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": MultiInputPolicy}
+    WRAPPERS: ClassVar[tuple[type[VecEnv], ...]] = (ShownTaskVecEnv,)
     ACTS_WITH: ClassVar[dict[str, Any]] = {"buffer_size": 1}
     FOLLOWS: ClassVar[dict[str, str]] = {
         "train_freq": "a rollout is an episode of each env",

@@ -1,6 +1,7 @@
 """What the zoo has to know of an algorithm: where it is, what its settings are, and how a model of it is loaded."""
 
 import importlib
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ class Algorithm:
     :param name: rl_zoo3's ``--algo``
     :param module: that its class is in, imported when it is needed
     :param class_name: of the class
-    :param settings: YAML file with its hyperparameters
+    :param settings: YAML file with its hyperparameters; of the package's, the name alone
     :param about: how an agent of it comes to know its task, for model cards
     :param also_explores_by: explorer that scores name beside its own
     """
@@ -92,3 +93,39 @@ ALGORITHMS = {
         ),
     )
 }
+
+
+def register_algorithm(name: str, model_class: type[Rival], settings: str | os.PathLike[str], about: str) -> None:
+    """
+    Add an algorithm, for methods to be trained by it, see :func:`sb3_htr.zoo.run.method.register_method`. In a module of one's
+    own, which ``--gym-packages`` names, it is at hand in all commands.
+
+    :param name: that no other algorithm has
+    :param model_class: of its models, at the top of a module, so that others can import it
+    :param settings: path of a YAML file with hyperparameters, as ``hyperparams/rl2.yml``
+    :param about: how an agent of it comes to know its task, a sentence for model cards
+    :raises ValueError: for a name that is taken or cannot be that of a folder, a class that is no rival or is within something
+    :raises FileNotFoundError: if there is no such file
+    """
+    check_folder_name("algorithm", name)
+    if name in ALGORITHMS:
+        raise ValueError(f"There is an algorithm {name!r} already: choose another name.")
+    if not issubclass(model_class, Rival):
+        raise ValueError(f"{model_class.__name__} is no subclass of sb3_htr.rivals.base.Rival, which says what is needed.")
+    path = Path(settings).resolve()
+    if not path.is_file():
+        raise FileNotFoundError(f"There is no file {path} with hyperparameters of {name!r}.")
+    algorithm = Algorithm(name, model_class.__module__, model_class.__qualname__, str(path), about)
+    if "." in algorithm.class_name:
+        raise ValueError(f"{algorithm.class_name} is within something: put the class at the top of its module.")
+    ALGORITHMS[name] = algorithm
+
+
+def check_folder_name(what: str, name: str) -> None:
+    """
+    :param what: has the name
+    :param name: of something that has folders of its own
+    :raises ValueError: if it cannot be that of a folder
+    """
+    if not name or set(name) & set("/\\ "):
+        raise ValueError(f"The name of the {what} is {name!r}, expected one that can be the name of a folder.")

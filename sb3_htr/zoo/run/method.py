@@ -11,7 +11,7 @@ from sb3_htr.adaptation.explorers import EXPLORERS
 from sb3_htr.common.settings import check_numbers, keywords_of
 from sb3_htr.htr.relabel import RELABELLERS, TrainingTaskRelabelling
 from sb3_htr.rivals.base import OwnWay
-from sb3_htr.zoo.run.algorithm import ALGORITHMS, Algorithm
+from sb3_htr.zoo.run.algorithm import ALGORITHMS, Algorithm, check_folder_name
 from sb3_htr.zoo.run.shipped import hyperparams_file
 
 DEFAULT = "htr-ser"
@@ -165,8 +165,7 @@ def register_method(name: str, **settings: Any) -> None:
     :raises ValueError: for a name that is taken, settings that are missing or not there, or an unknown relabeller, explorer
         or algorithm
     """
-    if not name or set(name) & set("/\\ "):
-        raise ValueError(f"The name of the method is {name!r}, expected one that can be the name of a folder.")
+    check_folder_name("method", name)
     try:
         method = _method(name, **settings)
     except TypeError as error:

@@ -1,0 +1,106 @@
+"""Raw results: of one run as it ends, and of many in one file for each method, as ``results/<name>/`` has them. And back."""
+
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_htr.common.arrays import load_arrays
+from sb3_htr.common.atomic import atomic_path
+from sb3_htr.experiments.cell import REMOVE, Cell
+from sb3_htr.experiments.runner import LOGGED
+
+# Of the code that trained, and of that which evaluated
+COMMITS = ("commit", "evaluation_commit")
+# What a report is made of
+NEEDED = ("timesteps", "curve", "solved", "elapsed_s", "calibration", *COMMITS, *LOGGED)
+
+
+def needed(cell: Cell) -> tuple[str, ...]:
+    """
+    :param cell: of an experiment
+    :return: names of the arrays that its raw results must have
+    """
+    return *NEEDED, *(f"returns_{evaluation.name}" for evaluation in cell.evaluations)
+
+
+def load(cell: Cell, path: Path) -> dict[str, Any]:
+    """
+    :param cell: of an experiment
+    :param path: its raw results
+    :return: arrays
+    :raises ValueError: if they are damaged, of something else, or lack something, as those of older versions do
+    """
+    cell.check_result(path)
+    return load_arrays(path, needed(cell), f"It may be of another version. {REMOVE}")
+
+
+def pack(results: Mapping[Cell, Path], folder: Path) -> None:
+    """
+    Write a ``raw-METHOD.npz`` for each method: of all together it may be some megabytes.
+
+    :param results: raw results of cells
+    :param folder: where they go
+    """
+    by_method: dict[str, dict[str, Any]] = {}
+    for cell, result in results.items():
+        arrays = {f"{cell.name}/{key}": value for key, value in load_arrays(result).items()}
+        by_method.setdefault(cell.method, {}).update(arrays)
+    for method, packed in by_method.items():
+        with atomic_path(_packed(folder, method)) as path:
+            np.savez_compressed(path, **packed)
+
+
+def unpack(folder: Path, cells: Sequence[Cell], runs: Path) -> int:
+    """
+    Make what :func:`pack` wrote finished runs, which nobody trains again. What is finished already stays.
+
+    :param folder: of results
+    :param cells: of an experiment
+    :param runs: folder of all experiments' runs
+    :return: how many of the runs the folder has
+    :raises ValueError: if it has none of them, or has one that is of something else or lacks something
+    """
+    load_method = cache(lambda path: load_arrays(path) if path.exists() else {})
+    found: dict[Cell, dict[str, Any]] = {}
+    for cell in cells:
+        path, start = _packed(folder, cell.method), f"{cell.name}/"
+        raw = {key.removeprefix(start): value for key, value in load_method(path).items() if key.startswith(start)}
+        if not raw:
+            continue
+        what, advice = f"{cell.name} in {path}", "leave the folder out of --with-results."
+        cell.check_facts(raw, what, advice)
+        if missing := sorted(set(needed(cell)) - set(raw)):
+            raise ValueError(f"{what} lacks {missing}, which {cell.experiment} needs: {advice}")
+        found[cell] = raw
+    if not found:
+        expected = f"raw-METHOD.npz with runs such as {cells[0].name}"
+        raise ValueError(f"{folder} has no run of {cells[0].experiment}: expected {expected}.")
+    for cell, whole in found.items():
+        if not cell.result(runs).exists():
+            with atomic_path(cell.result(runs)) as result:
+                np.savez_compressed(result, **whole)
+    return len(found)
+
+
+def check_none_lost(folder: Path, cells: Sequence[Cell]) -> None:
+    """
+    :param folder: of results, about to be written
+    :param cells: that they are of
+    :raises ValueError: if it has runs of others, which would be lost
+    """
+    there: set[str] = set()
+    for path in sorted(folder.glob("raw-*.npz")):
+        with np.load(path) as file:
+            there |= {key.partition("/")[0] for key in file.files}
+    if lost := sorted(there - {cell.name for cell in cells}):
+        raise ValueError(
+            f"{folder} has {len(lost)} runs that these results would not have, {lost[0]} among them: name another folder with "
+            f"-o, or keep what this one has with --with-results {folder}, and as many --seeds."
+        )
+
+
+def _packed(folder: Path, method: str) -> Path:
+    return folder / f"raw-{method}.npz"

@@ -1,0 +1,94 @@
+"""Results of one time are part of those of another: nothing is trained twice, mixed up, or lost."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from helpers import ENV_ID
+from helpers.results import made_up
+from sb3_htr.experiments import executors, grid, raw_results, report
+from sb3_htr.experiments.cell import Cell
+from sb3_htr.experiments.grid import Experiment, Variant, by
+from sb3_htr.zoo.cli import main
+
+THEIRS = tuple(map(Variant, ("htr-ser", "rl2", "pearl-sparse")))
+
+
+def experiment_of(name: str, *variants: Variant) -> Experiment:
+    return Experiment(name, "", ENV_ID, 480, variants, 2, eval_freq=240, evaluations=by(("prior",)))
+
+
+@pytest.fixture(autouse=True)
+def published(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Results of an experiment that somebody ran, and a working folder without its runs."""
+    monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 50)
+    monkeypatch.chdir(tmp_path)
+    theirs = experiment_of("theirs", *THEIRS)
+    monkeypatch.setitem(grid.EXPERIMENTS, "theirs", theirs)
+    monkeypatch.setitem(grid.EXPERIMENTS, "mine", experiment_of("mine", *THEIRS, Variant("htr-ser", "mine", {"gamma": 0.5})))
+    (tmp_path / "elsewhere").mkdir()
+    report.write("", theirs, made_up(theirs.cells(), tmp_path / "elsewhere"), tmp_path / "published")
+    return tmp_path / "published"
+
+
+def test_a_method_of_ones_own_is_trained_alone_and_reported_beside_what_others_ran(
+    published: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trained: list[str] = []
+
+    def train(cell: Cell, runs: Path) -> bool:
+        trained.append(cell.name)
+        made_up([cell], cell.result(runs).parent)
+        return True
+
+    monkeypatch.setattr("sb3_htr.experiments.driver.run_cell", train)
+    monkeypatch.setattr(executors, "Processes", lambda _: executors.Here())
+    assert main(["experiment", "mine", "--with-results", "published"]) == 0
+    assert "6 of 8 runs are in published." in capsys.readouterr().out
+    assert trained == ["mine-seed1", "mine-seed2"]
+    rows = json.loads(Path("results", "mine", "summary.json").read_text())["rows"]
+    assert {(row["variant"], row["n_seeds"]) for row in rows} == {("htr-ser", 2), ("rl2", 2), ("pearl-sparse", 2), ("mine", 2)}
+    raw, before = np.load("results/mine/raw-rl2.npz"), np.load(published / "raw-rl2.npz")
+    assert {*raw.files} == {*before.files} and all((raw[key] == before[key]).all() for key in before.files)
+
+
+def test_own_runs_come_before_those_of_others(published: Path) -> None:
+    cells = grid.EXPERIMENTS["theirs"].cells()
+    own = cells[0].result(Path("runs"))
+    own.parent.mkdir(parents=True)
+    np.savez(own, **{**np.load(made_up([cells[0]], own.parent)[cells[0]]), "commit": "my own"})
+    assert raw_results.unpack(published, cells, Path("runs")) == len(cells)
+    assert [str(np.load(cell.result(Path("runs")))["commit"]) for cell in cells] == ["my own"] + ["abc"] * (len(cells) - 1)
+
+
+def test_runs_of_something_else_are_not_taken(published: Path) -> None:
+    cells = grid.EXPERIMENTS["theirs"].cells()
+    others = [replace(cell, n_timesteps=960) for cell in cells]
+    with pytest.raises(ValueError, match=r"htr-ser-seed1 in .* has n_timesteps 480, but theirs/.* needs 960: leave"):
+        raw_results.unpack(published, others, Path("runs"))
+    others = [replace(cell, evaluations=by(("belief",))) for cell in cells]
+    with pytest.raises(ValueError, match=r"htr-ser-seed1 in .* lacks \['returns_belief'\], which theirs needs: leave"):
+        raw_results.unpack(published, others, Path("runs"))
+    with pytest.raises(ValueError, match=r"nowhere has no run of theirs: expected .* with runs such as htr-ser-seed1"):
+        raw_results.unpack(Path("nowhere"), cells, Path("runs"))
+    assert not Path("runs").exists(), "all or nothing"
+
+
+def test_results_do_not_replace_those_of_more_runs(published: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither with what is finished so far, nor, before anything is trained, with fewer seeds."""
+    monkeypatch.setattr("sb3_htr.experiments.driver.Driver", None)
+    before = {path.name: path.read_bytes() for path in published.iterdir()}
+    finished = grid.EXPERIMENTS["theirs"].cells()[3]
+    finished.result(Path("runs")).parent.mkdir(parents=True)
+    made_up([finished], finished.result(Path("runs")).parent)
+    message = r"published has 5 runs that these results would not have, htr-ser-seed1 among them: name another folder with -o"
+    with pytest.raises(ValueError, match=message):
+        main(["experiment", "theirs", "--finished", "-o", "published"])
+    with pytest.raises(ValueError, match=r"has 3 runs .*, or keep what this one has with --with-results published, and"):
+        main(["experiment", "theirs", "--seeds", "1", "-o", "published"])
+    assert {path.name: path.read_bytes() for path in published.iterdir()} == before
+    assert main(["experiment", "theirs", "--finished", "-o", "published", "--with-results", "published"]) == 0
+    assert {row["n_seeds"] for row in json.loads((published / "summary.json").read_text())["rows"]} == {2}

@@ -1,0 +1,103 @@
+"""A rival that comes from outside of the package, the example's."""
+
+import copy
+import importlib
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import PPO
+
+from helpers import ENV_ID
+from helpers.results import made_up
+from helpers.runs import run_folder
+from sb3_htr import evaluate_adaptation
+from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.experiments import grid, report
+from sb3_htr.rivals.rl2 import RL2
+from sb3_htr.zoo.cli import main
+from sb3_htr.zoo.run import algorithm, method
+from sb3_htr.zoo.run.agents import RECORD, agent_at
+
+MODULE = "examples.plain_ppo"
+SMALL: dict[str, Any] = {"n_steps": 40, "batch_size": 40, "n_epochs": 1, "policy_kwargs": {"net_arch": [4]}}
+PARAMS = [f"{key}:{value!r}".replace(" ", "") for key, value in {**SMALL, "n_envs": 4}.items()]
+
+
+@pytest.fixture(autouse=True)
+def registered(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The module; what it registers is forgotten afterwards."""
+    monkeypatch.setattr(algorithm, "ALGORITHMS", dict(algorithm.ALGORITHMS))
+    monkeypatch.setattr(method, "ALGORITHMS", algorithm.ALGORITHMS)
+    monkeypatch.setattr(grid, "EXPERIMENTS", dict(grid.EXPERIMENTS))
+    yield importlib.import_module(MODULE)
+    sys.modules.pop(MODULE)
+    method.methods.cache_clear()
+
+
+def test_the_commands_know_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It trains, goes on exactly where it was killed, is evaluated and watched."""
+    packages = ["--gym-packages", MODULE]
+    runs = [tmp_path / "once", tmp_path / "twice"]
+    for folder, n in zip(runs, ("640", "320"), strict=True):
+        what = ["--env", ENV_ID, *packages, "--method", "plain-ppo", "-n", n, "--seed", "1"]
+        assert main(["train", *what, "-f", str(folder), "--eval-freq", "-1", "--verbose", "0", "-params", *PARAMS]) == 0
+    run, begun = (run_folder(folder, "plain-ppo") for folder in runs)
+    assert main(["train", "--resume", str(begun), "-n", "320", *packages]) == 0
+    weights = [agent_at(folder, "last").load().policy.state_dict() for folder in (run, begun)]
+    assert all(th.equal(value, weights[1][name]) for name, value in weights[0].items())
+    assert json.loads((run / RECORD).read_text())["method"] == "plain-ppo"
+    assert main(["evaluate", str(run), *packages, "--n-episodes", "2", "-o", str(tmp_path)]) == 0
+    few = ["--no-render", "--n-tasks", "1", "--n-episodes", "1", "-f", str(runs[0])]
+    assert main(["enjoy", "--env", ENV_ID, *packages, "--method", "plain-ppo", *few]) == 0
+    assert "explorer 'own'" in capsys.readouterr().out
+
+
+def test_it_is_what_the_library_trains(registered: Any) -> None:
+    """Nothing is between SB3's algorithm and the env but the reset before each rollout, in which no episode is cut here."""
+    env, own = (make_task_vec_env(ENV_ID, 4, seed=0) for _ in range(2))
+    theirs = PPO("MlpPolicy", env, seed=0, **copy.deepcopy(SMALL)).learn(160)
+    ours = registered.PlainPPO("MlpPolicy", own, seed=0, **copy.deepcopy(SMALL)).learn(160)
+    assert all(th.equal(value, ours.policy.state_dict()[name]) for name, value in theirs.policy.state_dict().items())
+    returns, _ = evaluate_adaptation(ours, ENV_ID, n_episodes=2)
+    np.testing.assert_array_equal(returns[:, 0], returns[:, 1], "it does not adapt")
+    # Also where it trained, as its observations are those of the env
+    assert evaluate_adaptation(ours, own, n_episodes=1)[0].shape == (100, 1)
+
+
+def test_its_experiment_has_the_runs_of_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 50)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "made").mkdir()
+    rivals = grid.EXPERIMENTS["rivals"]
+    report.write("", rivals, made_up(rivals.cells(), tmp_path / "made"), tmp_path / "published")
+    given = ["--gym-packages", MODULE, "--with-results", "published", "--finished"]
+    assert main(["experiment", "plain_ppo", *given]) == 0
+    rows = json.loads(Path("results", "plain_ppo", "summary.json").read_text())["rows"]
+    assert {row["variant"] for row in rows} == {variant.name or variant.method for variant in rivals.variants}
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"name": "rl2"}, "There is an algorithm 'rl2' already"),
+        ({"name": "my ppo"}, "The name of the algorithm is 'my ppo', expected one that can be the name of a folder"),
+        ({"model_class": PPO}, "PPO is no subclass of sb3_htr.rivals.base.Rival"),
+        ({"model_class": type("Inner", (RL2,), {"__qualname__": "outer.<locals>.Inner"})}, "put the class at the top"),
+        ({"settings": "nowhere.yml"}, r"There is no file .*nowhere\.yml with hyperparameters of 'mine'"),
+    ],
+)
+def test_what_is_no_algorithm(changed: dict[str, Any], message: str, tmp_path: Path) -> None:
+    (tmp_path / "mine.yml").write_text("default: {}\n")
+    whole: dict[str, Any] = {"name": "mine", "model_class": RL2, "settings": tmp_path / "mine.yml", "about": "It is mine."}
+    before = dict(algorithm.ALGORITHMS)
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        algorithm.register_algorithm(**{**whole, **changed})
+    assert before == algorithm.ALGORITHMS
+    algorithm.register_algorithm(**whole)
+    assert algorithm.ALGORITHMS["mine"].model_class() is RL2
