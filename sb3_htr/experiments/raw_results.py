@@ -89,12 +89,10 @@ def check_none_lost(folder: Path, cells: Sequence[Cell]) -> None:
     """
     :param folder: of results, about to be written
     :param cells: that they are of
-    :raises ValueError: if it has runs of others, which would be lost
+    :raises ValueError: if it has runs of others, which would be lost, or damaged files
     """
-    there: set[str] = set()
-    for path in sorted(folder.glob("raw-*.npz")):
-        with np.load(path) as file:
-            there |= {key.partition("/")[0] for key in file.files}
+    packed = (load_arrays(path, advice="Move it away.") for path in folder.glob("raw-*.npz"))
+    there = {key.partition("/")[0] for arrays in packed for key in arrays}
     if lost := sorted(there - {cell.name for cell in cells}):
         raise ValueError(
             f"{folder} has {len(lost)} runs that these results would not have, {lost[0]} among them: name another folder with "
