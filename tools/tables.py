@@ -11,7 +11,7 @@ from sb3_htr.zoo.run.method import OWN
 
 RESULTS = Path(__file__).parents[1] / "results"
 DOCUMENTS = (RESULTS.parent / "README.md", RESULTS.parent / "docs" / "results.md", RESULTS.parent / "docs" / "performance.md")
-# The tables of README.md: methods by their experiments; explorers with what is shown of them
+# The table of README.md, and of PEARL's own protocol: methods by their experiments; explorers with what is shown of them
 HEADLINES: dict[str, dict[str, tuple[str, ...]]] = {
     "headline": {
         "point_robot": ("htr-ser", "pearl-dense", "pearl-sparse"),
