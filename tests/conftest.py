@@ -31,10 +31,10 @@ def tiny_pearl() -> MakePEARL:
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Trials of a hyperparameter search take a moment."""
 
-    def sample_little(trial: Any, *_: Any) -> dict[str, Any]:
+    def sample_little(space: Any, trial: Any, *_: Any) -> dict[str, Any]:
         rate = trial.suggest_float("learning_rate", 1e-4, 1e-3)
         return {"learning_rate": rate, "gradient_steps": 2, "policy_kwargs": TINY["policy_kwargs"]}
 
-    monkeypatch.setattr("sb3_htr.zoo.run.manager.sample_pearl_params", sample_little)
-    monkeypatch.setattr("sb3_htr.zoo.run.manager.convert_pearl_params", lambda params: params)
+    monkeypatch.setattr("sb3_htr.zoo.run.search_space.SearchSpace.sample", sample_little)
+    monkeypatch.setattr("sb3_htr.zoo.run.search_space.SearchSpace.convert", lambda space, params: params)
     monkeypatch.setattr("sb3_htr.zoo.commands.optimize.PAUSE", 0.05)

@@ -56,6 +56,8 @@ def test_the_commands_know_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     few = ["--no-render", "--n-tasks", "1", "--n-episodes", "1", "-f", str(runs[0])]
     assert main(["enjoy", "--env", ENV_ID, *packages, "--method", "plain-ppo", *few]) == 0
     assert "explorer 'own'" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="what to search for plain-ppo: give register_algorithm a search_space"):
+        main(["optimize", "--env", ENV_ID, *packages, "--method", "plain-ppo", "-f", str(tmp_path)])
 
 
 def test_it_is_what_the_library_trains(registered: Any) -> None:

@@ -1,5 +1,6 @@
 """``sb3-htr optimize``: what is searched for, and where the study is kept."""
 
+import json
 import logging
 import os
 import shlex
@@ -8,6 +9,7 @@ import subprocess
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +24,11 @@ from sb3_htr import PEARL
 from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.commands import optimize, train
+from sb3_htr.zoo.run import search_space
+from sb3_htr.zoo.run.agents import RECORD
+from sb3_htr.zoo.run.algorithm import ALGORITHMS
 from sb3_htr.zoo.run.manager import MetaExperimentManager
 from sb3_htr.zoo.run.method import PEARLMethod, get_method, merged, methods
-from sb3_htr.zoo.run.search_space import ENCODER_ARCHS, convert_pearl_params, sample_pearl_params
 from sb3_htr.zoo.run.storage import absolute, without_password
 
 SMALL = ["-params", "n_tasks_per_rollout:4", "n_episodes_per_task:3", "learning_starts:240", "n_envs:4"]
@@ -196,21 +200,57 @@ def test_what_is_sampled_makes_a_model_of_the_method_and_is_what_is_loaded(name:
     study, method = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0)), get_method(name)
     assert isinstance(method, PEARLMethod)
     relabels = method.relabel_probability > 0
-    how = relabels, "hindsight_task_strategy" in method.relabeller_settings()
+    space, of_others = search_space.PEARL, method.not_searched()
     sampled_probabilities = set()
     for _ in range(4):
         trial = study.ask()
-        sampled = sample_pearl_params(trial, *how)
-        assert sampled == convert_pearl_params(trial.params) and 0.8 <= sampled["gamma"] < 1
+        sampled = space.sample(trial, of_others)
+        assert sampled == space.convert(trial.params) and 0.8 <= sampled["gamma"] < 1
+        assert ("hindsight_task_strategy" in trial.params) == (method.name.split("-prior")[0] in ("htr-ser", "htr-ec"))
         assert sampled["learning_rate"] == f"lin_{trial.params['learning_rate']}"
         sampled = MetaExperimentManager._preprocess_schedules(sampled)
         model = PEARL("MlpPolicy", ENV_ID, **merged(method.hyperparams(), sampled))
         assert model.policy.latent_dim == trial.params["latent_dim"]
-        assert model.policy.encoder_arch == ENCODER_ARCHS[trial.params["encoder_arch"]]
+        assert model.policy.encoder_arch == sampled["policy_kwargs"]["encoder_arch"]
         buffer = model.replay_buffer
         assert buffer is not None and type(buffer.relabeller).__name__ == method.relabeller
         sampled_probabilities.add(buffer.relabel_probability)
     assert len(sampled_probabilities) > 1 if relabels else sampled_probabilities == {0.0}
+
+
+@pytest.mark.parametrize("name", ["rl2", "sac-her"])
+def test_what_is_sampled_of_a_rival_makes_a_model_of_it(name: str) -> None:
+    study, algorithm = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0)), get_method(name).algorithm
+    space = algorithm.search_space
+    assert space is not None
+    for _ in range(4):
+        trial = study.ask()
+        sampled = space.sample(trial)
+        assert sampled == space.convert(trial.params)
+        model = algorithm.model_class()(algorithm.model_class().DEFAULT_POLICY, ENV_ID, **sampled)
+        assert (model.gamma, model.ent_coef) == (1 - trial.params["one_minus_gamma"], trial.params["ent_coef"])
+        assert model.policy_kwargs["net_arch"] == sampled["policy_kwargs"]["net_arch"]
+    with pytest.raises(ValueError, match=r"The trial has kl_coef 0\.1, which sb3-htr optimize does not try"):
+        space.convert({"kl_coef": 0.1})
+
+
+def test_a_rival_is_searched_for_and_trained_with_what_was_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    little = search_space.SearchSpace(ints={"n_epochs": (2, 3)}, choices={"lstm_hidden_size": (4, 8)})
+    little = replace(little, within={"lstm_hidden_size": ("policy_kwargs",)})
+    monkeypatch.setitem(ALGORITHMS, "rl2", replace(ALGORITHMS["rl2"], search_space=little))
+    small = ["-params", "n_envs:4", "n_episodes_per_trial:2", "n_trials_per_rollout:1", "policy_kwargs:{'net_arch':[4]}"]
+    storage = ["--study-name", "test", "--storage", f"sqlite:///{tmp_path}/study.db", "-f", str(tmp_path), "--verbose", "0"]
+    arguments = ["--env", ENV_ID, "--method", "rl2", "--env-kwargs", "goal_distance:0.1", "-n", "320"]
+    assert main(["optimize", *arguments, *storage, "--n-trials", "2", "--n-evaluations", "2", *small]) == 0
+    assert "Train with the best trial so far: sb3-htr train" in capsys.readouterr().out
+    trial = optimize.create_study(storage[3], "test").trials[1]
+    assert set(trial.params) == {"n_epochs", "lstm_hidden_size"}
+    assert main(["train", *arguments, *storage, "--trial-id", "1", "--eval-freq", "-1", *small]) == 0
+    record = json.loads((run_folder(tmp_path, "rl2") / RECORD).read_text())["hyperparams"]
+    assert record["n_epochs"] == trial.params["n_epochs"] and record["ent_coef"] == 0.01, "the file's stays"
+    assert record["policy_kwargs"] == {"net_arch": [4], "lstm_hidden_size": trial.params["lstm_hidden_size"]}
 
 
 def test_what_a_user_gives_is_not_searched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -244,7 +284,7 @@ def test_a_trial_joins_the_settings_of_the_file(tmp_path: Path) -> None:
     study = optimize.create_study(storage, "test")
     study.enqueue_trial({"learning_rate": 0.002, "relabel_probability": 0.3})
     asked = study.ask()
-    sample_pearl_params(asked)
+    search_space.PEARL.sample(asked)
     study.tell(asked, 1.0)
     block: dict[str, Any] = {key: value for key, value in TINY.items() if key != "seed"}
     block |= {"policy": "MlpPolicy", "n_timesteps": 240, "n_envs": 4}

@@ -95,7 +95,6 @@ def test_a_run_of_a_rival_goes_on(runs: Path, tmp_path: Path) -> None:
         (["--algo", "ppo"], "--algo is 'ppo', but sb3-htr trains rl2"),
         (["-params", "n_steps:20"], "RL2 has no setting 'n_steps': it follows from n_trials_per_rollout"),
         (["-params", "lstm:20"], "RL2 has no setting 'lstm'"),
-        (["-params", "method:'htr-ser'", "-optimize"], "The search is for settings of PEARL, and rl2 has none"),
     ],
 )
 def test_mistakes_are_answered_in_one_sentence(arguments: list[str], message: str, tmp_path: Path) -> None:

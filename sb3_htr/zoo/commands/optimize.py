@@ -13,16 +13,17 @@ import sqlalchemy
 from sb3_htr.zoo.commands import train
 from sb3_htr.zoo.run.storage import opened, url_of, without_password
 
-HELP = """sb3-htr optimize: rl_zoo3's `train -optimize` (its arguments follow) for PEARL, with Optuna.
+HELP = """sb3-htr optimize: rl_zoo3's `train -optimize` (its arguments follow) for methods of ours, with Optuna.
 
 The objective is the mean return of the last adaptation episode on the validation tasks; the test tasks stay unseen.
-The search space is in sb3_htr/zoo/run/search_space.py; what it does not name stays as in the YAML file.
-What -params names stays as given, and is not searched.
+The search space is that of the method's algorithm, in sb3_htr/zoo/run/search_space.py. What it does not name stays as in
+the YAML file. What -params names stays as given, and is not searched.
 
 examples:
   sb3-htr optimize --env SparsePointRobot-v0 -n 40000 --n-trials 20
   sb3-htr optimize --env SparsePointRobot-v0 -n 40000 --study-name htr --storage sqlite:///study.db --max-total-trials 50
   sb3-htr optimize ... -params gradient_steps:200 "policy_kwargs:{'net_arch':[64,64]}"
+  sb3-htr optimize ... --method rl2 -n 400000
   sb3-htr optimize ... --study-name htr --storage postgresql+psycopg://user:password@host/database
   sb3-htr train --env SparsePointRobot-v0 --study-name htr --storage sqlite:///study.db --trial-id 7
 

@@ -11,6 +11,8 @@ import gymnasium as gym
 from sb3_htr.pearl import PEARL, load_untrusted
 from sb3_htr.rivals.base import Rival
 from sb3_htr.rivals.untrusted import load_untrusted as load_untrusted_rival
+from sb3_htr.zoo.run import search_space
+from sb3_htr.zoo.run.search_space import SearchSpace
 from sb3_htr.zoo.run.shipped import hyperparams_file
 
 # What a run trains and a command adapts
@@ -26,6 +28,7 @@ class Algorithm:
     :param settings: YAML file with its hyperparameters; of the package's, the name alone
     :param about: how an agent of it comes to know its task, for model cards
     :param also_explores_by: explorer that scores name beside its own
+    :param search_space: what ``optimize`` searches through, None for nothing
     """
 
     name: str
@@ -34,6 +37,7 @@ class Algorithm:
     settings: str
     about: str
     also_explores_by: tuple[str, ...] = ()
+    search_space: SearchSpace | None = None
 
     @property
     def settings_file(self) -> str:
@@ -76,6 +80,7 @@ ALGORITHMS = {
             "pearl.yml",
             "It is not told its task: it tries a few episodes, infers the task from sparse rewards, and then solves it.",
             also_explores_by=("prior",),
+            search_space=search_space.PEARL,
         ),
         Algorithm(
             "rl2",
@@ -83,6 +88,7 @@ ALGORITHMS = {
             "RL2",
             "rl2.yml",
             "It is not told its task: it tries a few episodes, and its memory has what it found there.",
+            search_space=search_space.RL2,
         ),
         Algorithm(
             "sac-her",
@@ -90,12 +96,19 @@ ALGORITHMS = {
             "SACHER",
             "sac_her.yml",
             "It is told its task, which makes it a ceiling for agents that are not.",
+            search_space=search_space.SAC_HER,
         ),
     )
 }
 
 
-def register_algorithm(name: str, model_class: type[Rival], settings: str | os.PathLike[str], about: str) -> None:
+def register_algorithm(
+    name: str,
+    model_class: type[Rival],
+    settings: str | os.PathLike[str],
+    about: str,
+    search_space: SearchSpace | None = None,
+) -> None:
     """
     Add an algorithm, for methods to be trained by it, see :func:`sb3_htr.zoo.run.method.register_method`. In a module of one's
     own, which ``--gym-packages`` names, it is at hand in all commands.
@@ -104,6 +117,7 @@ def register_algorithm(name: str, model_class: type[Rival], settings: str | os.P
     :param model_class: of its models, at the top of a module, so that others can import it
     :param settings: path of a YAML file with hyperparameters, as ``hyperparams/rl2.yml``
     :param about: how an agent of it comes to know its task, a sentence for model cards
+    :param search_space: what ``optimize`` searches through, None for nothing
     :raises ValueError: for a name that is taken or cannot be that of a folder, a class that is no rival or is within something
     :raises FileNotFoundError: if there is no such file
     """
@@ -115,7 +129,7 @@ def register_algorithm(name: str, model_class: type[Rival], settings: str | os.P
     path = Path(settings).resolve()
     if not path.is_file():
         raise FileNotFoundError(f"There is no file {path} with hyperparameters of {name!r}.")
-    algorithm = Algorithm(name, model_class.__module__, model_class.__qualname__, str(path), about)
+    algorithm = Algorithm(name, model_class.__module__, model_class.__qualname__, str(path), about, search_space=search_space)
     if "." in algorithm.class_name:
         raise ValueError(f"{algorithm.class_name} is within something: put the class at the top of its module.")
     ALGORITHMS[name] = algorithm

@@ -52,8 +52,7 @@ from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback, ProgressCallback
 from sb3_htr.zoo.run.defaults import given_arguments
 from sb3_htr.zoo.run.folder import SystemLock, claim, lock
 from sb3_htr.zoo.run.kinds import checked_kinds
-from sb3_htr.zoo.run.method import DEFAULT, PEARLMethod, get_method, merged, names_of
-from sb3_htr.zoo.run.search_space import convert_pearl_params, sample_pearl_params
+from sb3_htr.zoo.run.method import DEFAULT, get_method, merged, names_of
 from sb3_htr.zoo.run.shipped import find_hyperparams
 from sb3_htr.zoo.run.storage import check_is_there, opened
 from sb3_htr.zoo.run.trust import PACKAGES, check_arguments, plain_settings, refuse
@@ -104,8 +103,11 @@ class MetaExperimentManager(ExperimentManager):
         self.method = get_method(self._method_name or in_params)
         if self.method.algorithm.name != self.algo:
             raise ValueError(f"{self.method.name} is trained by another algorithm: choose it by --method {self.method.name}.")
-        if self.optimize_hyperparameters and not isinstance(self.method, PEARLMethod):
-            raise ValueError(f"The search is for settings of PEARL, and {self.method.name} has none: choose another --method.")
+        if self.optimize_hyperparameters and self.method.algorithm.search_space is None:
+            raise ValueError(
+                f"Nothing is known of what to search for {self.method.name}: give register_algorithm a search_space, or "
+                "choose another --method."
+            )
         checked = partial(plain_settings, trust=self.trust, named=self.args.gym_packages)
         hyperparams = checked_kinds(checked(hyperparams, self.config), self.config)
         if (otherwise := self.method.set_otherwise(hyperparams)) and self.resumed is None:
@@ -365,15 +367,11 @@ class MetaExperimentManager(ExperimentManager):
         :raises optuna.TrialPruned: for hyperparameters that promise little or diverge
         """
         try:
-            assert isinstance(self.method, PEARLMethod)
-            how = (
-                self.method.relabel_probability > 0,
-                "hindsight_task_strategy" in self.method.relabeller_settings(),
-                names_of(self._given),
-            )
-            HYPERPARAMS_SAMPLER[self.algo] = lambda trial, *_: merged(
-                self._hyperparams, self._preprocess_schedules(sample_pearl_params(trial, *how))
-            )
+            space = self.method.algorithm.search_space
+            assert space is not None
+            sampled = space.sample(trial, names_of(self._given) | self.method.not_searched())
+            # To rl_zoo3, dicts of the file are gone where the sampler has one
+            HYPERPARAMS_SAMPLER[self.algo] = lambda *_: merged(self._hyperparams, self._preprocess_schedules(sampled))
             return super().objective(trial)
         except DivergedError as error:
             print(f"Trial {trial.number} is pruned: {error}")
@@ -483,7 +481,8 @@ def run_rl_zoo(
     :param trust: whether files may have code run
     """
     ALGOS[algorithm.name] = algorithm.model_class()
-    HYPERPARAMS_CONVERTER["pearl"] = convert_pearl_params
+    if algorithm.search_space is not None:
+        HYPERPARAMS_CONVERTER[algorithm.name] = algorithm.search_space.convert
     manager = partial(MetaExperimentManager, method=method, resumed=resumed, trust=trust)
     # rl_zoo3 looks these names up when it needs them
     replaced: dict[ModuleType, dict[str, Any]] = {

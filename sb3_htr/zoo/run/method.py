@@ -53,6 +53,12 @@ class Method:
         """
         return []
 
+    def not_searched(self) -> set[str]:
+        """
+        :return: names in the search space of its algorithm that say nothing of this method
+        """
+        return set()
+
     def explorer_for(self, name: str) -> str:
         """
         :param name: of an explorer that agents are to be evaluated with
@@ -127,6 +133,11 @@ class PEARLMethod(Method):
         :return: names of the settings that its relabeller has
         """
         return keywords_of(RELABELLERS[self.relabeller])
+
+    def not_searched(self) -> set[str]:
+        if self.relabel_probability == 0:
+            return {"relabel_probability", "hindsight_task_strategy"}
+        return {"hindsight_task_strategy"} - self.relabeller_settings()
 
     def explorer_for(self, name: str) -> str:
         return name

@@ -1,6 +1,7 @@
-"""Hyperparameters that ``sb3-htr optimize`` searches through."""
+"""Hyperparameters that ``sb3-htr optimize`` searches through, of each algorithm."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -9,87 +10,112 @@ from sb3_htr.htr import HindsightTaskStrategy
 if TYPE_CHECKING:
     import optuna
 
-# As in rl_zoo3, layers are sampled by name
-NET_ARCHS = {"small": [64, 64], "medium": [128, 128], "paper": [300, 300, 300]}
-# HTR paper, A.2
-RELABEL_PROBABILITIES = (0.1, 0.3, 0.5, 0.8, 1.0)
-STRATEGIES = [strategy.value for strategy in HindsightTaskStrategy]
-ENCODER_ARCHS = {"small": [64, 64], "medium": [128, 128], "paper": [200, 200, 200]}
-ARCHS = {"net_arch": NET_ARCHS, "encoder_arch": ENCODER_ARCHS}
+ONE_MINUS, POW = "one_minus_", "_pow"
 
 
-# Drawn from their logarithm. The learning rate is that of the beginning, and falls to 0 as PEARL's default does; episodes have
-# some tens to hundreds of steps, which is what the discount must reach over
-FLOATS = {
-    "learning_rate": (1e-4, 3e-3),
-    "one_minus_gamma": (0.005, 0.2),
-    "tau": (0.002, 0.05),
-    "ent_coef": (1e-3, 1e-1),
-    "kl_coef": (1e-4, 1e-1),
-}
-INTS = {
-    "n_steps": (1, 10),
-    "batch_size_pow": (3, 8),
-    "meta_batch_size_pow": (3, 6),
-    "gradient_steps_pow": (6, 9),
-    "latent_dim": (2, 8),
-}
-
-
-def sample_pearl_params(
-    trial: "optuna.Trial", relabels: bool = True, chooses_states: bool = True, given: Collection[str] = ()
-) -> dict[str, Any]:
+@dataclass(frozen=True)
+class SearchSpace:
     """
-    :param trial: draws the values
-    :param relabels: whether the method relabels; how often it does is sampled then
-    :param chooses_states: whether its hindsight tasks are states that an episode reached; which ones is sampled then
-    :param given: names of arguments that somebody has chosen already: they are not sampled
-    :return: arguments of PEARL, as a YAML file of rl_zoo3 has them
+    What is sampled, by name. ``one_minus_X`` is 1 - X, and ``X_pow`` the X-th power of 2.
+
+    :param floats: ends of ranges, drawn from their logarithm
+    :param ints: ends of ranges
+    :param choices: values; or, as in rl_zoo3, names of such
+    :param within: of names that are not arguments of the algorithm, the arguments they are within, from the outermost one
+    :param learning_rate_falls: to 0 at the end of the training
     """
-    choices: dict[str, Sequence[Any]] = {"net_arch": list(NET_ARCHS), "encoder_arch": list(ENCODER_ARCHS)}
-    if relabels:
-        choices["relabel_probability"] = RELABEL_PROBABILITIES
-    if relabels and chooses_states:
-        choices["hindsight_task_strategy"] = STRATEGIES
-    draws: dict[str, Callable[[], Any]] = {
-        **{name: partial(trial.suggest_float, name, *ends, log=True) for name, ends in FLOATS.items()},
-        **{name: partial(trial.suggest_int, name, *ends) for name, ends in INTS.items()},
-        **{name: partial(trial.suggest_categorical, name, values) for name, values in choices.items()},
-    }
-    return convert_pearl_params({name: draw() for name, draw in draws.items() if _argument(name) not in given})
+
+    floats: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    ints: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    choices: Mapping[str, Collection[Any] | Mapping[str, Any]] = field(default_factory=dict)
+    within: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    learning_rate_falls: bool = False
+
+    def sample(self, trial: "optuna.Trial", without: Collection[str] = ()) -> dict[str, Any]:
+        """
+        :param trial: draws the values
+        :param without: names of arguments that are not sampled, because somebody has chosen them or the method has no use for
+            them
+        :return: arguments of the algorithm, as a YAML file of rl_zoo3 has them
+        """
+        draws: dict[str, Callable[[], Any]] = {
+            **{name: partial(trial.suggest_float, name, *ends, log=True) for name, ends in self.floats.items()},
+            **{name: partial(trial.suggest_int, name, *ends) for name, ends in self.ints.items()},
+            **{name: partial(trial.suggest_categorical, name, [*values]) for name, values in self.choices.items()},
+        }
+        return self.convert({name: draw() for name, draw in draws.items() if _argument(name) not in without})
+
+    def convert(self, sampled_params: dict[str, Any]) -> dict[str, Any]:
+        """
+        :param sampled_params: of a trial
+        :return: arguments of the algorithm, as a YAML file of rl_zoo3 has them
+        :raises ValueError: for what is not sampled here
+        """
+        converted: dict[str, Any] = {}
+        for name, value in sampled_params.items():
+            values = self.choices.get(name, ())
+            if name not in self.floats and name not in self.ints and value not in values:
+                raise ValueError(
+                    f"The trial has {name} {value!r}, which sb3-htr optimize does not try: it is of another program."
+                )
+            owner = converted
+            for outer in self.within.get(name, ()):
+                owner = owner.setdefault(outer, {})
+            if isinstance(values, Mapping):
+                value = values[value]
+            elif name.startswith(ONE_MINUS):
+                value = 1 - value
+            elif name.endswith(POW):
+                value = 2**value
+            elif name == "learning_rate" and self.learning_rate_falls:
+                value = f"lin_{value}"
+            owner[_argument(name)] = value
+        return converted
 
 
 def _argument(name: str) -> str:
     """Which argument is sampled by this name."""
-    return name.removesuffix("_pow").removeprefix("one_minus_")
+    return name.removesuffix(POW).removeprefix(ONE_MINUS)
 
 
-def convert_pearl_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
-    """
-    :param sampled_params: of a trial
-    :return: arguments of PEARL, as a YAML file of rl_zoo3 has them
-    """
-    policy: dict[str, Any] = {}
-    replay: dict[str, Any] = {}
-    converted: dict[str, Any] = {}
-    for name, value in sampled_params.items():
-        if name == "one_minus_gamma":
-            converted["gamma"] = 1 - value
-        elif name == "learning_rate":
-            converted[name] = f"lin_{value}"
-        elif name.endswith("_pow"):
-            converted[_argument(name)] = 2**value
-        elif name == "latent_dim":
-            policy[name] = value
-        elif name in ARCHS and value in ARCHS[name]:
-            policy[name] = ARCHS[name][value]
-        elif name == "relabel_probability":
-            replay[name] = value
-        elif name == "hindsight_task_strategy":
-            replay["relabeller"] = {name: value}
-        elif name in FLOATS or name in INTS:
-            converted[name] = value
-        else:
-            raise ValueError(f"The trial has {name} {value!r}, which sb3-htr optimize does not try: it is of another program.")
-    nested = {"policy_kwargs": policy, "replay_buffer_kwargs": replay}
-    return {**converted, **{name: kwargs for name, kwargs in nested.items() if kwargs}}
+ARCHS = {"small": [64, 64], "medium": [128, 128]}
+# Episodes have some tens to hundreds of steps, which is what the discount must reach over
+OF_ALL = {"learning_rate": (1e-4, 3e-3), "one_minus_gamma": (0.005, 0.2)}
+
+PEARL = SearchSpace(
+    floats={**OF_ALL, "tau": (0.002, 0.05), "ent_coef": (1e-3, 1e-1), "kl_coef": (1e-4, 1e-1)},
+    ints={
+        "n_steps": (1, 10),
+        "batch_size_pow": (3, 8),
+        "meta_batch_size_pow": (3, 6),
+        "gradient_steps_pow": (6, 9),
+        "latent_dim": (2, 8),
+    },
+    choices={
+        "net_arch": {**ARCHS, "paper": [300, 300, 300]},
+        "encoder_arch": {**ARCHS, "paper": [200, 200, 200]},
+        "relabel_probability": (0.1, 0.3, 0.5, 0.8, 1.0),  # HTR paper, A.2
+        "hindsight_task_strategy": [strategy.value for strategy in HindsightTaskStrategy],
+    },
+    within={
+        **dict.fromkeys(("net_arch", "encoder_arch", "latent_dim"), ("policy_kwargs",)),
+        "relabel_probability": ("replay_buffer_kwargs",),
+        "hindsight_task_strategy": ("replay_buffer_kwargs", "relabeller"),
+    },
+    learning_rate_falls=True,  # as PEARL's default does
+)
+
+# What rl_zoo3 samples of recurrent PPO, but for what a trial settles: steps of a rollout and of a minibatch
+RL2 = SearchSpace(
+    floats={**OF_ALL, "one_minus_gae_lambda": (0.005, 0.2), "ent_coef": (1e-4, 1e-1), "max_grad_norm": (0.3, 2.0)},
+    ints={"n_trials_per_rollout": (1, 8), "n_epochs": (2, 20), "lstm_hidden_size_pow": (5, 8)},
+    choices={"clip_range": (0.1, 0.2, 0.3), "net_arch": ARCHS},
+    within=dict.fromkeys(("lstm_hidden_size_pow", "net_arch"), ("policy_kwargs",)),
+)
+
+SAC_HER = SearchSpace(
+    floats={**OF_ALL, "tau": (0.002, 0.05), "ent_coef": (1e-3, 1e-1)},
+    ints={"batch_size_pow": (6, 10), "n_sampled_goal": (1, 8)},
+    choices={"net_arch": {**ARCHS, "large": [256, 256]}},
+    within={"net_arch": ("policy_kwargs",), "n_sampled_goal": ("replay_buffer_kwargs",)},
+)
