@@ -76,6 +76,11 @@ class Cell:
         kwargs = "".join(f"-{key}{value}" for key, value in self.env_kwargs.items())
         return re.sub(r"[^\w.=-]+", "_", f"{self.variant}{kwargs}-seed{self.seed}".replace(" ", ""))
 
+    @property
+    def label(self) -> str:
+        """In messages, among cells of several experiments."""
+        return f"{self.experiment}/{self.name}"
+
     def run_folder(self, runs: Path) -> Path:
         """
         :param runs: folder of all experiments' runs
@@ -115,8 +120,7 @@ class Cell:
         given, own = json.loads(str(raw["cell"])) if "cell" in raw else {}, json.loads(self.facts())
         if different := [name for name, value in given.items() if value != own.get(name)]:
             name = different[0]
-            needs = f"{self.experiment}/{self.name} needs {own.get(name)!r}"
-            raise ValueError(f"{what} has {name} {given[name]!r}, but {needs}: {advice}")
+            raise ValueError(f"{what} has {name} {given[name]!r}, but {self.label} needs {own.get(name)!r}: {advice}")
 
     def training(self, folder: Path) -> list[str]:
         """

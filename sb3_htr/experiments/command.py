@@ -1,4 +1,4 @@
-"""``sb3-htr experiment``: repeat an experiment of this project, all its runs and its tables and pictures."""
+"""``sb3-htr experiment``: repeat experiments of this project, all their runs, tables and pictures."""
 
 import argparse
 import sys
@@ -13,8 +13,9 @@ from sb3_htr.zoo.commands.arguments import OF_PACKAGES, make_parser
 from sb3_htr.zoo.run.trust import import_packages
 
 EXAMPLE = """  sb3-htr experiment point_robot --jobs 2
+  sb3-htr experiment rivals wheeled ant --ray auto --runs /shared/runs
+                                                        all methods on three envs, five seeds each, on a Ray cluster
   sb3-htr experiment ant --quick                        one seed, a tenth of the env steps: does it run?
-  sb3-htr experiment ant --ray auto --runs /shared/runs      on a Ray cluster
   sb3-htr experiment ant --finished                     tables and pictures, of what has been run so far
   sb3-htr experiment mine --gym-packages my_method --with-results results/rivals
                                                         beside runs that were made before, which are not trained again"""
@@ -22,20 +23,63 @@ EXAMPLE = """  sb3-htr experiment point_robot --jobs 2
 
 def main(argv: Sequence[str]) -> None:
     """The command, with its arguments."""
+    args = _parse(argv)
+    how_many = (args.seeds or 1, 0.1) if args.quick else (args.seeds,)
+    grids = {name: grid.EXPERIMENTS[name].cells(*how_many) for name in args.names}
+    grids = {name: [replace(cell, gym_packages=tuple(args.gym_packages)) for cell in cells] for name, cells in grids.items()}
+    chosen = [cell for cells in grids.values() for cell in cells]
+    if args.cell is not None:
+        if not 0 <= args.cell < len(chosen):
+            raise ValueError(f"--cell is {args.cell}, expected 0 to {len(chosen) - 1}: there are {len(chosen)} runs.")
+        chosen = [chosen[args.cell]]
+    quick = "quick-" if args.quick else ""
+    runs = (args.runs / "quick" if args.quick else args.runs).resolve()
+    outputs = {name: Path("results", quick + name) for name in grids}
+    if args.output is not None:
+        outputs = {name: args.output / name if len(grids) > 1 else args.output for name in grids}
+    for name, cells in grids.items():
+        for folder in args.with_results:
+            print(f"{raw_results.unpack(folder, cells, runs)} of {len(cells)} runs are in {folder}.")
+        report.check(finished([cell for cell in cells if cell in chosen], runs))
+        if not args.finished and args.cell is None:
+            raw_results.check_none_lost(outputs[name], cells)
+    if not args.finished:
+        here = executors.Here() if args.cell is not None else executors.Processes(args.jobs)
+        try:
+            driver.Driver(chosen, runs, executors.Ray(args.ray) if args.ray else here).run()
+        except KeyboardInterrupt:
+            print(f"\nStopped. What ran goes on from its checkpoint in {runs} with the same command.", file=sys.stderr)
+            raise SystemExit(130) from None
+    if args.cell is not None:
+        return
+    results = {name: finished(cells, runs) for name, cells in grids.items()}
+    for name, done in results.items():
+        if not done:
+            raise ValueError(f"No run of {name} is finished in {runs}: run it without --finished, or name other --runs.")
+        print(f"{len(done)} of {len(grids[name])} runs of {name} are finished.")
+    for name, done in results.items():
+        how = ("--quick " if args.quick else "") + f"--seeds {len({cell.seed for cell in grids[name]})}"
+        how += f" --gym-packages {' '.join(args.gym_packages)}" if args.gym_packages else ""
+        report.write(f"sb3-htr experiment {name} {how}", grid.EXPERIMENTS[name], done, outputs[name])
+        print(f"Results: {outputs[name]}")
+
+
+def _parse(argv: Sequence[str]) -> argparse.Namespace:
     own = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     own.add_argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help=OF_PACKAGES)
     # Before the names of experiments are asked for
-    packages = own.parse_known_args(argv)[0].gym_packages
-    import_packages(packages)
+    import_packages(own.parse_known_args(argv)[0].gym_packages)
     names = "\n".join(f"  {name:<16} {experiment.env_id}: {experiment.about}" for name, experiment in grid.EXPERIMENTS.items())
-    about = f"Repeat an experiment; a killed one goes on where it stopped.\n\n{names}"
+    about = f"Repeat experiments; a killed one goes on where it stopped.\n\n{names}"
     parser = make_parser("experiment", about, EXAMPLE, parents=[own])
-    parser.add_argument("name", choices=list(grid.EXPERIMENTS), metavar="NAME", help="one of the above")
+    several = "one of the above, or several, whose cells are in one queue"
+    parser.add_argument("names", nargs="+", choices=list(grid.EXPERIMENTS), metavar="NAME", help=several)
     parser.add_argument("--seeds", type=int, help="runs of each variant (default: those of the experiment)")
     parser.add_argument("--quick", action="store_true", help="a tenth of the env steps, and one seed unless told otherwise")
     runs = "folder for the runs; those of an experiment resume from RUNS/NAME (default: runs)"
     parser.add_argument("--runs", type=Path, default=Path("runs"), help=runs)
-    parser.add_argument("-o", "--output", type=Path, help="folder for the results (default: results/NAME)")
+    output = "folder for the results, of several experiments in OUTPUT/NAME (default: results/NAME)"
+    parser.add_argument("-o", "--output", type=Path, help=output)
     earlier = "folders of results: runs that they have are finished, and not trained again"
     parser.add_argument("--with-results", type=Path, nargs="+", default=[], metavar="FOLDER", help=earlier)
     where = parser.add_mutually_exclusive_group()
@@ -48,37 +92,9 @@ def main(argv: Sequence[str]) -> None:
     check_numbers(**{name: (n, 1) for name, n in given.items() if n is not None})
     if ":/" in str(args.runs):
         raise ValueError(f"--runs is {args.runs}, expected a folder: object stores have to be mounted.")
-    experiment = grid.EXPERIMENTS[args.name]
-    cells = experiment.cells(args.seeds or 1, 0.1) if args.quick else experiment.cells(args.seeds)
-    cells = [replace(cell, gym_packages=tuple(packages)) for cell in cells]
-    if args.cell is not None and not 0 <= args.cell < len(cells):
-        raise ValueError(f"--cell is {args.cell}, expected 0 to {len(cells) - 1}: the experiment has {len(cells)} runs.")
-    quick = "quick-" if args.quick else ""
-    runs = (args.runs / "quick" if args.quick else args.runs).resolve()
-    output = args.output or Path("results", quick + args.name)
-    for folder in args.with_results:
-        print(f"{raw_results.unpack(folder, cells, runs)} of {len(cells)} runs are in {folder}.")
-    chosen = cells if args.cell is None else [cells[args.cell]]
-    report.check(finished(chosen, runs))
-    if not args.finished:
-        if args.cell is None:
-            raw_results.check_none_lost(output, cells)
-        here = executors.Here() if args.cell is not None else executors.Processes(args.jobs)
-        try:
-            driver.Driver(chosen, runs, executors.Ray(args.ray) if args.ray else here).run()
-        except KeyboardInterrupt:
-            print(f"\nStopped. What ran goes on from its checkpoint in {runs} with the same command.", file=sys.stderr)
-            raise SystemExit(130) from None
-        if args.cell is not None:
-            return
-    results = finished(cells, runs)
-    if not results:
-        raise ValueError(f"No run of {args.name} is finished in {runs}: run it without --finished, or name other --runs.")
-    print(f"{len(results)} of {len(cells)} runs are finished.")
-    how = ("--quick " if args.quick else "") + f"--seeds {len({cell.seed for cell in cells})}"
-    how += f" --gym-packages {' '.join(packages)}" if packages else ""
-    report.write(f"sb3-htr experiment {args.name} {how}", experiment, results, output)
-    print(f"Results: {output}")
+    if args.with_results and len(args.names) > 1:
+        raise ValueError("--with-results is for one experiment at a time: runs of several have the same names.")
+    return args
 
 
 def finished(cells: Sequence[Cell], runs: Path) -> dict[Cell, Path]:

@@ -1,4 +1,4 @@
-"""Runs the cells of an experiment on an executor: skips what is done, tries again what failed, waits for what others run."""
+"""Runs the cells of experiments on an executor: skips what is done, tries again what failed, waits for what others run."""
 
 import os
 import sys
@@ -23,9 +23,9 @@ PERIOD, LINES = 5.0, 60.0
 
 class Driver:
     """
-    Knows of the cells of an experiment what is in the folder of the runs, and no more: others may run them, too.
+    Knows of the cells of experiments what is in the folder of the runs, and no more: others may run them, too.
 
-    :param cells: of one experiment
+    :param cells: of one experiment, or of several
     :param runs: folder of all experiments' runs, which all nodes see under this name
     :param executor: where cells run
     """
@@ -47,9 +47,9 @@ class Driver:
         self.runs.mkdir(parents=True, exist_ok=True)
         try:
             while todo := self._look():
-                submitted = {cell.name for cell in self._futures.values()}
+                submitted = {cell.label for cell in self._futures.values()}
                 for cell in todo:
-                    if cell.name not in submitted and not self.is_claimed(cell):
+                    if cell.label not in submitted and not self.is_claimed(cell):
                         self._futures[self.executor.submit(run_cell, cell, self.runs)] = cell
                 self._wait()
         except BaseException:
@@ -69,12 +69,12 @@ class Driver:
         :return: cells that have no result, and were not given up
         """
         results = self._results()
-        return [cell for cell in self.cells if cell.result(self.runs).name not in results and cell.name not in self.failed]
+        return [cell for cell in self.cells if cell.result(self.runs) not in results and cell.label not in self.failed]
 
-    def _results(self) -> set[str]:
-        """Names of result files. A listing is fresh where answers about single files may be remembered, as by NFS."""
-        folder = self.cells[0].result(self.runs).parent
-        return set(os.listdir(folder)) if folder.exists() else set()
+    def _results(self) -> set[Path]:
+        """Result files. A listing is fresh where answers about single files may be remembered, as by NFS."""
+        folders = {cell.result(self.runs).parent for cell in self.cells}
+        return {folder / name for folder in folders if folder.exists() for name in os.listdir(folder)}
 
     def is_claimed(self, cell: Cell) -> bool:
         """
@@ -103,7 +103,7 @@ class Driver:
         """
         total, now = sum(cell.n_timesteps for cell in self.cells), time.monotonic()
         left = self._n_steps_left(todo)
-        given_up = self._n_steps_left([cell for cell in self.cells if cell.name in self.failed])
+        given_up = self._n_steps_left([cell for cell in self.cells if cell.label in self.failed])
         start, before = self._start = self._start or (now, left)
         n_running = sum(self.is_claimed(cell) for cell in todo)
         parts = [f"{len(self.cells) - len(todo) - len(self.failed)} of {len(self.cells)} cells done", f"{n_running} running"]
@@ -142,14 +142,14 @@ class Driver:
             self._fail(cell, f"{type(error).__name__}: {error}".strip().splitlines()[-1])
         elif error is not None:
             raise error
-        elif future.result() and cell.result(self.runs).name not in self._results():
+        elif future.result() and cell.result(self.runs) not in self._results():
             self._fail(cell, f"its node has a result that is not in {self.runs} here: give --runs that all nodes see.")
 
     def _fail(self, cell: Cell, reason: str) -> None:
-        at = cell.name, self.n_steps(cell)
+        at = cell.label, self.n_steps(cell)
         self._failures[at] += 1
         given_up = self._failures[at] == ATTEMPTS
         what = f"failed {ATTEMPTS} times" if given_up else "failed, and is tried again"
-        print(f"{cell.name} {what} at {at[1]:,} env steps: {reason}", file=sys.stderr, flush=True)
+        print(f"{cell.label} {what} at {at[1]:,} env steps: {reason}", file=sys.stderr, flush=True)
         if given_up:
-            self.failed[cell.name] = reason
+            self.failed[cell.label] = reason

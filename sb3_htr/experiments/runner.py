@@ -138,7 +138,7 @@ def find_finished(cell: Cell, folder: Path) -> tuple[Path, Model] | None:
         for key in (*OF_RUN, *sorted({*has, *needs})):
             if has.get(key) != needs.get(key):
                 raise ValueError(
-                    f"{run} has {key} {has.get(key)!r}, but {cell.experiment}/{cell.name} needs {needs.get(key)!r}, as the "
+                    f"{run} has {key} {has.get(key)!r}, but {cell.label} needs {needs.get(key)!r}, as the "
                     "experiment or the YAML file says: move this run away, or choose other --runs."
                 )
         if is_finished(run, cell.env_id, cell.n_timesteps):

@@ -100,7 +100,7 @@ def test_failures_are_tried_again_from_where_they_were_and_reported(
             raise OSError("out of memory")
 
     trained = trains(work)
-    with pytest.raises(ValueError, match=r"1 of 6 cells failed 3 times .* htr-ser-seed1: RuntimeError: no luck"):
+    with pytest.raises(ValueError, match=r"1 of 6 cells failed 3 times .*/htr-ser-seed1: RuntimeError: no luck"):
         Driver(CELLS, tmp_path, Here()).run()
     assert trained.count(hopeless.name) == ATTEMPTS and trained.count(slow.name) == 2 * ATTEMPTS + 1 and len(set(trained)) == 6
     out, err = capsys.readouterr()
@@ -125,7 +125,7 @@ def test_progress_counts_cells_and_env_steps(tmp_path: Path, monkeypatch: pytest
         (running.run_folder(tmp_path) / "htr-ec/run_1/checkpoints/1200_steps").mkdir()
         assert driver.line(driver.todo()) == "1 of 6 cells done, 1 running, 33 % of the env steps, 0:02:00 left"
     # What was given up is not done
-    driver.failed[CELLS[2].name] = "no luck"
+    driver.failed[CELLS[2].label] = "no luck"
     assert "1 of 6 cells done, 0 running, 1 failed, 33 % of the env steps" in driver.line(driver.todo())
 
 

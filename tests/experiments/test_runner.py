@@ -19,6 +19,7 @@ from sb3_htr.common.checkpoint import write_checkpoint
 from sb3_htr.common.resume import checkpoints
 from sb3_htr.experiments import grid
 from sb3_htr.experiments.cell import Cell
+from sb3_htr.experiments.executors import Here
 from sb3_htr.experiments.grid import Experiment, Variant, by
 from sb3_htr.experiments.protocol import evaluate
 from sb3_htr.experiments.runner import find_finished, run_cell
@@ -263,6 +264,38 @@ def test_one_cell_of_a_job_array_writes_no_tables(tmp_path: Path, monkeypatch: p
         main(["experiment", "pair", "--cell", "2"])
 
 
+def test_one_command_runs_several_experiments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their cells have the same names, are in one queue, and go on; each experiment has results of its own."""
+    queue: list[str] = []
+
+    def train(cell: Cell, runs: Path) -> bool:
+        queue.append(f"{cell.experiment} {cell.env_kwargs} {cell.name[-5:]}")
+        cell.result(runs).parent.mkdir(parents=True, exist_ok=True)
+        made_up([cell], cell.result(runs).parent)
+        return True
+
+    for name, distance in (("near", 0.5), ("far", 2.0)):
+        variants = (
+            Variant("htr-ser", settings={"gamma": distance / 4}, env_kwargs={"goal_distance": distance}),
+            Variant("rl2"),
+        )
+        experiment = Experiment(name, "", ENV_ID, 480, variants, 1, eval_freq=240, evaluations=by(("prior",)))
+        monkeypatch.setitem(grid.EXPERIMENTS, name, experiment)
+    monkeypatch.setattr("sb3_htr.experiments.driver.run_cell", train)
+    monkeypatch.setattr("sb3_htr.experiments.executors.Processes", lambda _: Here())
+    monkeypatch.chdir(tmp_path)
+    assert main(["experiment", "near", "far", "--cell", "3"]) == 0
+    assert queue == ["far {} seed1"] and not Path("results").exists()
+    assert main(["experiment", "near", "far", "-o", "both"]) == 0
+    assert queue[1:] == ["near {'goal_distance': 0.5} seed1", "near {} seed1", "far {'goal_distance': 2.0} seed1"]
+    for name in ("near", "far"):
+        summary = json.loads(Path("both", name, "summary.json").read_text())
+        assert summary["name"] == name and {row["variant"] for row in summary["rows"]} == {"htr-ser", "rl2"}
+        assert summary["command"] == f"sb3-htr experiment {name} --seeds 1"
+    with pytest.raises(ValueError, match="--with-results is for one experiment at a time"):
+        main(["experiment", "near", "far", "--with-results", "both/near"])
+
+
 def test_results_of_what_is_finished_are_written_without_training(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -277,7 +310,7 @@ def test_results_of_what_is_finished_are_written_without_training(
     second.result(Path("runs")).parent.mkdir(parents=True)
     made_up([second], second.result(Path("runs")).parent)
     assert main(["experiment", "pair", "--finished"]) == 0
-    assert "1 of 2 runs are finished." in capsys.readouterr().out
+    assert "1 of 2 runs of pair are finished." in capsys.readouterr().out
     summary = json.loads(Path("results", "pair", "summary.json").read_text())
     assert {row["n_seeds"] for row in summary["rows"]} == {1} and summary["command"] == "sb3-htr experiment pair --seeds 2"
     for wrong in (["--cell", "1"], ["--seed", "7"]):
