@@ -32,6 +32,7 @@ def main(argv: Sequence[str]) -> None:
         if not 0 <= args.cell < len(chosen):
             raise ValueError(f"--cell is {args.cell}, expected 0 to {len(chosen) - 1}: there are {len(chosen)} runs.")
         chosen = [chosen[args.cell]]
+    of_command = {*chosen}
     quick = "quick-" if args.quick else ""
     runs = (args.runs / "quick" if args.quick else args.runs).resolve()
     outputs = {name: Path("results", quick + name) for name in grids}
@@ -40,7 +41,7 @@ def main(argv: Sequence[str]) -> None:
     for name, cells in grids.items():
         for folder in args.with_results:
             print(f"{raw_results.unpack(folder, cells, runs)} of {len(cells)} runs are in {folder}.")
-        report.check(finished([cell for cell in cells if cell in chosen], runs))
+        report.check(finished([cell for cell in cells if cell in of_command], runs))
         if not args.finished and args.cell is None:
             raw_results.check_none_lost(outputs[name], cells)
     if not args.finished:
