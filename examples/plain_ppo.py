@@ -8,18 +8,17 @@ before. It is a floor: what a policy gets that cannot adapt.
 """
 
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch as th
 from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_htr.adaptation.loop import Adapting
-from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
 from sb3_htr.experiments.grid import EXPERIMENTS, Experiment, Variant
-from sb3_htr.rivals.base import Rival, RivalAdaptation
+from sb3_htr.rivals.base import RivalAdaptation
+from sb3_htr.rivals.on_policy import OnPolicyRival
 from sb3_htr.zoo.run.algorithm import register_algorithm
 from sb3_htr.zoo.run.method import register_method
 
@@ -36,24 +35,11 @@ class Unadapted(RivalAdaptation):
         return self.policy.scale_action(actions)
 
 
-class PlainPPO(Rival, PPO):
-    """
-    PPO on envs of a task family.
-
-    :param policy: ``"MlpPolicy"`` or a class
-    :param env: env of a task family, VecEnv of such envs, or registered id
-    :param seed: seed of all random generators
-    :param kwargs: arguments of ``PPO``
-    """
+class PlainPPO(OnPolicyRival, PPO):
+    """PPO on envs of a task family, with the arguments of ``PPO``."""
 
     DEFAULT_POLICY: ClassVar[str] = "MlpPolicy"
     policy: ActorCriticPolicy
-
-    def __init__(self, policy: Any, env: GymEnv | str | None, seed: int | None = None, **kwargs: Any) -> None:
-        seed = self._check_settings(policy, seed, kwargs)
-        if isinstance(env, str):
-            env = make_task_vec_env(env, N_ENVS, seed)
-        super().__init__(policy, env, seed=seed, **kwargs)  # type: ignore[arg-type]
 
     def _adaptation(self, n_envs: int, generator: th.Generator | None) -> Adapting:
         return Unadapted(self.policy, n_envs)

@@ -55,14 +55,20 @@ def main(argv: Sequence[str]) -> None:
         return
     results = {name: finished(cells, runs) for name, cells in grids.items()}
     for name, done in results.items():
-        if not done:
-            raise ValueError(f"No run of {name} is finished in {runs}: run it without --finished, or name other --runs.")
         print(f"{len(done)} of {len(grids[name])} runs of {name} are finished.")
-    for name, done in results.items():
+        if not done:
+            continue
         how = ("--quick " if args.quick else "") + f"--seeds {len({cell.seed for cell in grids[name]})}"
         how += f" --gym-packages {' '.join(args.gym_packages)}" if args.gym_packages else ""
+        # Those of its own folder are runs of the experiment, made by this command before
+        others = [str(folder) for folder in args.with_results if folder.resolve() != outputs[name].resolve()]
+        how += f" --with-results {' '.join(others)}" if others else ""
         report.write(f"sb3-htr experiment {name} {how}", grid.EXPERIMENTS[name], done, outputs[name])
         print(f"Results: {outputs[name]}")
+    if nothing := [name for name, done in results.items() if not done]:
+        raise ValueError(
+            f"No run of {' and of '.join(nothing)} is finished in {runs}: run it without --finished, or name other --runs."
+        )
 
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:

@@ -1,5 +1,6 @@
 """Raw results: of one run as it ends, and of many in one file for each method, as ``results/<name>/`` has them. And back."""
 
+import json
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -10,7 +11,7 @@ import numpy as np
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.experiments.cell import REMOVE, Cell
-from sb3_htr.experiments.runner import LOGGED
+from sb3_htr.experiments.runner import LOGGED, hyperparams_of
 
 # Of the code that trained, and of that which evaluated
 COMMITS = ("commit", "evaluation_commit")
@@ -61,7 +62,8 @@ def unpack(folder: Path, cells: Sequence[Cell], runs: Path) -> int:
     :param cells: of an experiment
     :param runs: folder of all experiments' runs
     :return: how many of the runs the folder has
-    :raises ValueError: if it has none of them, or has one that is of something else or lacks something
+    :raises ValueError: if it has none of them, or has one that is of something else, that was trained with other
+        hyperparameters, or that lacks something, be it what it is of
     """
     load_method = cache(lambda path: load_arrays(path) if path.exists() else {})
     found: dict[Cell, dict[str, Any]] = {}
@@ -71,9 +73,12 @@ def unpack(folder: Path, cells: Sequence[Cell], runs: Path) -> int:
         if not raw:
             continue
         what, advice = f"{cell.name} in {path}", "leave the folder out of --with-results."
-        cell.check_facts(raw, what, advice)
-        if missing := sorted(set(needed(cell)) - set(raw)):
+        if missing := sorted({"cell", "hyperparams", *needed(cell)} - set(raw)):
             raise ValueError(f"{what} lacks {missing}, which {cell.experiment} needs: {advice}")
+        cell.check_facts(raw, what, advice)
+        theirs, own = json.loads(str(raw["hyperparams"])), hyperparams_of(cell)
+        if different := sorted(key for key in {*own, *theirs} if own.get(key) != theirs.get(key)):
+            raise ValueError(f"{what} was trained with other {different} than {cell.experiment} would: {advice}")
         found[cell] = raw
     if not found:
         expected = f"raw-METHOD.npz with runs such as {cells[0].name}"
@@ -89,14 +94,22 @@ def check_none_lost(folder: Path, cells: Sequence[Cell]) -> None:
     """
     :param folder: of results, about to be written
     :param cells: that they are of
-    :raises ValueError: if it has runs of others, which would be lost, or damaged files
+    :raises ValueError: if it has runs of others, or others of the same names, which would be lost; or damaged files
     """
-    packed = (load_arrays(path, advice="Move it away.") for path in folder.glob("raw-*.npz"))
-    there = {key.partition("/")[0] for arrays in packed for key in arrays}
-    if lost := sorted(there - {cell.name for cell in cells}):
+    by_name = {cell.name: cell for cell in cells}
+    advice = "name another folder with -o, or move this one away."
+    lost = set()
+    for path in folder.glob("raw-*.npz"):
+        arrays = load_arrays(path, advice="Move it away.")
+        for name in {key.partition("/")[0] for key in arrays}:
+            if name not in by_name:
+                lost.add(name)
+            elif f"{name}/cell" in arrays:
+                by_name[name].check_facts({"cell": arrays[f"{name}/cell"]}, f"{name} in {path}", advice)
+    if lost:
         raise ValueError(
-            f"{folder} has {len(lost)} runs that these results would not have, {lost[0]} among them: name another folder with "
-            f"-o, or keep what this one has with --with-results {folder}, and as many --seeds."
+            f"{folder} has {len(lost)} runs that these results would not have, {min(lost)} among them: {advice} Runs of the "
+            f"same experiment are kept by --with-results {folder}, and as many --seeds."
         )
 
 

@@ -17,6 +17,8 @@ from sb3_htr.common.versions import commit, named, processor
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.log import logged
 from sb3_htr.experiments.protocol import evaluate
+from sb3_htr.rivals.base import Rival
+from sb3_htr.rivals.untrusted import plain_policy
 from sb3_htr.zoo.commands import train
 from sb3_htr.zoo.run.agents import RECORD, agent_at, file_stem, find_runs, is_finished, n_steps_of, read_record
 from sb3_htr.zoo.run.algorithm import Model
@@ -91,6 +93,7 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
     import_packages(cell.gym_packages)
     trained = find_finished(cell, folder)
     if trained is None:
+        _check_loadable(cell)
         numbered = sorted(folder.glob("*/*"), key=lambda run: run_number(run, file_stem(cell.env_id)))
         unfinished = [run for run in numbered if checkpoints(run)]
         packages = ["--gym-packages", *cell.gym_packages] if cell.gym_packages else []
@@ -133,7 +136,7 @@ def find_finished(cell: Cell, folder: Path) -> tuple[Path, Model] | None:
     for run in find_runs(folder) if any(folder.rglob(RECORD)) else ():
         record = read_record(run / RECORD)
         has = {**training_facts(record["hyperparams"], record["arguments"]), **{key: record[key] for key in OF_RUN}}
-        needs = _planned(cell, folder)
+        needs = planned(cell)
         # What others follow from comes first
         for key in (*OF_RUN, *sorted({*has, *needs})):
             if has.get(key) != needs.get(key):
@@ -146,11 +149,33 @@ def find_finished(cell: Cell, folder: Path) -> tuple[Path, Model] | None:
     return None
 
 
-def _planned(cell: Cell, folder: Path) -> dict[str, Any]:
-    """What the training of a cell is, as its record will say it."""
+def hyperparams_of(cell: Cell) -> dict[str, Any]:
+    """
+    :param cell: of an experiment
+    :return: hyperparameters that it is trained with, as its record will have them
+    """
     method = get_method(cell.method)
     blocks = yaml.safe_load(Path(method.algorithm.settings_file).read_text())
     of_env = {key: value for key, value in blocks.get(cell.env_id, blocks["default"]).items() if key != "method"}
     used = {**merged(method.settings(of_env), cell.settings), "n_timesteps": cell.n_timesteps}
-    facts = {**training_facts(used, cell.training(folder)), **{key: getattr(cell, key) for key in OF_RUN}}
-    return cast(dict[str, Any], json.loads(json.dumps(facts, default=str)))  # which knows no tuples
+    return cast(dict[str, Any], json.loads(json.dumps(used, default=str)))  # which knows no tuples
+
+
+def planned(cell: Cell) -> dict[str, Any]:
+    """
+    :param cell: of an experiment
+    :return: what its training is, as its record will say it
+    """
+    facts = {**training_facts(hyperparams_of(cell), cell.training(Path())), **{key: getattr(cell, key) for key in OF_RUN}}
+    return cast(dict[str, Any], json.loads(json.dumps(facts, default=str)))
+
+
+def _check_loadable(cell: Cell) -> None:
+    """Before it is trained: its model will be loaded as those of strangers are."""
+    model_class = get_method(cell.method).algorithm.model_class()
+    if issubclass(model_class, Rival):
+        try:
+            plain_policy(model_class, hyperparams_of(cell))
+        except ValueError as error:
+            advice = f"Leave it out, or name it in POLICY_SIZES of {model_class.__name__}."
+            raise ValueError(f"{cell.label} could not be evaluated: {error}. {advice}") from None

@@ -8,7 +8,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
-from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -21,6 +21,7 @@ from sb3_htr.common.random_state import checked_seed
 from sb3_htr.common.saving import CheckedFiles
 from sb3_htr.common.settings import check_keywords, check_numbers
 from sb3_htr.common.training_state import Resumable
+from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
 
 SelfRival = TypeVar("SelfRival", bound="Rival")
 
@@ -117,7 +118,8 @@ class FreshStart(BaseCallback):
 
 class Rival(CheckedFiles, Resumable):
     """
-    A mixin for algorithms of Stable-Baselines3. It is made as :class:`sb3_htr.PEARL` is: of a policy and an env of a task
+    What :class:`~sb3_htr.rivals.on_policy.OnPolicyRival` and :class:`~sb3_htr.rivals.off_policy.OffPolicyRival` share, mixins
+    for algorithms of Stable-Baselines3. It is made as :class:`sb3_htr.PEARL` is: of a policy and an env of a task
     family. What the algorithm needs around the env is put there by its ``_wrap_env``, see :attr:`WRAPPERS`.
 
     A rollout begins with a reset of all envs, as PEARL's do, so that a training that goes on from a checkpoint is the same as
@@ -128,10 +130,25 @@ class Rival(CheckedFiles, Resumable):
     DEFAULT_POLICY: ClassVar[str]
     #: What its ``_wrap_env`` puts around an env, to show the agent more than the env's observations
     WRAPPERS: ClassVar[tuple[type[VecEnv], ...]] = ()
+    #: Settings of its policy, whole numbers, beside those of SB3 and sb3-contrib, with the largest that a file may ask for
+    POLICY_SIZES: ClassVar[dict[str, int]] = {}
     #: Settings, whole numbers, that an agent which is loaded to act has of its training, and those that it has in their place
     ACTS_BY: ClassVar[tuple[str, ...]] = ()
     ACTS_WITH: ClassVar[dict[str, Any]] = {}
     explorer = OwnWay()
+
+    def __init__(self, policy: Any, env: GymEnv | str | None, seed: int | None = None, **kwargs: Any) -> None:
+        """
+        :param policy: name or class
+        :param env: env of a task family, VecEnv of such envs, or registered id
+        :param seed: seed of all random generators
+        :param kwargs: arguments of the library's class but those in :attr:`FOLLOWS`
+        :raises ValueError: for a setting that is unknown, or an env without tasks or time limit
+        """
+        seed = self._check_settings(policy, seed, kwargs)
+        if isinstance(env, str):
+            env = make_task_vec_env(env, N_ENVS, seed)
+        super().__init__(policy=policy, env=env, seed=seed, **kwargs)
 
     def _check_settings(self, policy: Any, seed: int | None, settings: dict[str, Any]) -> int | None:
         """
@@ -207,12 +224,21 @@ class Rival(CheckedFiles, Resumable):
         # The library counts from where a training was resumed; a rival asks :attr:`logs_now`
         return super().learn(total_timesteps, callback, 1, *args, **kwargs)  # type: ignore[safe-super]
 
-    def logs_now(self, n_rollouts: int) -> bool:
+    @property
+    @abstractmethod
+    def n_steps_per_rollout(self) -> int:
+        """Env steps of all envs together."""
+
+    @property
+    def n_rollouts(self) -> int:
+        """Since the beginning of the training, which may have been resumed."""
+        return self.num_timesteps // self.n_steps_per_rollout
+
+    def logs_now(self) -> bool:
         """
-        :param n_rollouts: since the beginning of the training, which may have been resumed
-        :return: whether a log is due
+        :return: whether a log is due after this rollout
         """
-        return self._log_interval is not None and n_rollouts % self._log_interval == 0
+        return self._log_interval is not None and self.n_rollouts % self._log_interval == 0
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_log_interval"]

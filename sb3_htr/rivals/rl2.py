@@ -15,7 +15,8 @@ from sb3_htr.adaptation.loop import Adapting
 from sb3_htr.common.checks import check_is_env, check_is_not_normalized, get_max_episode_steps
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.vec_env import N_ENVS, in_float32, make_task_vec_env
-from sb3_htr.rivals.base import Rival, RivalAdaptation
+from sb3_htr.rivals.base import RivalAdaptation
+from sb3_htr.rivals.on_policy import OnPolicyRival
 from sb3_htr.rivals.trial_policy import TrialLstmPolicy
 from sb3_htr.rivals.trials import LastStep, TrialVecEnv
 
@@ -64,7 +65,7 @@ class TrialAdaptation(RivalAdaptation):
         self._memory[:, :, beyond], self._last.columns[beyond] = self._kept_memory[:, :, beyond], self._kept_last[beyond]
 
 
-class RL2(Rival, RecurrentPPO):
+class RL2(OnPolicyRival, RecurrentPPO):
     """
     RL2: a recurrent policy that is trained to do well over a whole trial, several episodes on one task, so that it learns to
     find out in the first ones what the last ones need. Its observation has its last action, the last reward and whether an
@@ -119,7 +120,8 @@ class RL2(Rival, RecurrentPPO):
             kwargs.setdefault("batch_size", N_TRIALS_PER_BATCH * env.max_trial_steps)
         self.n_episodes_per_trial = n_episodes_per_trial
         self.n_trials_per_rollout = n_trials_per_rollout
-        super().__init__(policy=policy, env=env, n_steps=n_steps, seed=seed, **kwargs)  # type: ignore[arg-type]
+        # What a rival checks was checked, and n_steps is no setting
+        RecurrentPPO.__init__(self, policy, env, n_steps=n_steps, seed=seed, **kwargs)  # type: ignore[arg-type]
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
@@ -157,14 +159,6 @@ class RL2(Rival, RecurrentPPO):
                 f"Whole trials in this env are rollouts of {n_steps} steps, but those of the model have {self.n_steps}: give "
                 "an env of the same time limit, or make a new model."
             )
-
-    def dump_logs(self, iteration: int = 0) -> None:
-        """
-        :param iteration: not used: rollouts are counted from the beginning of the training, which may have been resumed
-        """
-        n_rollouts = self.num_timesteps // (self.n_steps * self.n_envs)
-        if self.logs_now(n_rollouts):
-            super().dump_logs(n_rollouts)
 
     def _adaptation(self, n_envs: int, generator: th.Generator | None) -> Adapting:
         return TrialAdaptation(self.policy, n_envs, self.n_episodes_per_trial)

@@ -9,9 +9,8 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import DictReplayBufferSamples, GymEnv, RolloutReturn, TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.type_aliases import DictReplayBufferSamples, GymEnv
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 from stable_baselines3.sac import SAC
@@ -29,9 +28,10 @@ from sb3_htr.common.checks import (
 )
 from sb3_htr.common.settings import check_keywords, check_numbers
 from sb3_htr.common.type_aliases import Trajectory
-from sb3_htr.common.vec_env import N_ENVS, in_float32, make_task_vec_env
+from sb3_htr.common.vec_env import in_float32
 from sb3_htr.htr.reward_hook import check_rewards_told
-from sb3_htr.rivals.base import Rival, ToldAdaptation, unscaled
+from sb3_htr.rivals.base import ToldAdaptation, unscaled
+from sb3_htr.rivals.off_policy import OffPolicyRival
 from sb3_htr.rivals.shown_task import ShownTaskVecEnv
 
 # Arguments of the replay buffer that are the model's
@@ -94,40 +94,14 @@ class TaskHerReplayBuffer(HerReplayBuffer):
             self.family_facts = family_facts(self.env.shown.family)
         return super().__getstate__()
 
-    def state_dict(self) -> dict[str, Any]:
-        """
-        :return: tensors and numbers, for :meth:`load_state_dict`
-        """
-        end = self.buffer_size if self.full else self.pos
-        arrays = {name: th.from_numpy(array[:end].copy()) for name, array in self._arrays().items()}
-        return {"arrays": arrays, "begun": th.tensor(self._current_ep_start), "pos": self.pos, "full": self.full}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """
-        :param state: of :meth:`state_dict` of a buffer with the same settings
-        """
-        for name, array in self._arrays().items():
-            saved = state["arrays"][name].cpu().numpy()
-            array[: len(saved)] = saved
-        self._current_ep_start = state["begun"].cpu().numpy().copy()
-        self.pos, self.full = state["pos"], state["full"]
-
     def truncate_last_trajectory(self) -> None:
         """End the episodes that are not complete, because all envs are about to be reset."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # SB3 takes it for a mistake
             super().truncate_last_trajectory()
 
-    def _arrays(self) -> dict[str, np.ndarray]:
-        plain = ("actions", "rewards", "dones", "timeouts", "ep_start", "ep_length")
-        return {
-            **{name: getattr(self, name) for name in plain},
-            **{f"observations/{key}": array for key, array in self.observations.items()},
-            **{f"next_observations/{key}": array for key, array in self.next_observations.items()},
-        }
 
-
-class SACHER(Rival, SAC):
+class SACHER(OffPolicyRival, SAC):
     """
     SAC with HER, whose observation has the task in it: how well the family can be solved by an agent that knows its task, of
     the same library and trained on the same sparse rewards. Papers: https://arxiv.org/abs/1812.05905,
@@ -135,8 +109,6 @@ class SACHER(Rival, SAC):
 
     It takes every family whose tasks are functions of a state: the task that a step achieves must be the same whatever the
     observation before it and the action are. Others are refused in their first step.
-
-    A rollout is one episode of each env, or as many steps where episodes end early.
 
     :param policy: ``"MultiInputPolicy"`` or a class
     :param env: env of a task family, VecEnv of such envs, or registered id
@@ -152,9 +124,8 @@ class SACHER(Rival, SAC):
     DEFAULT_POLICY: ClassVar[str] = "MultiInputPolicy"
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": MultiInputPolicy}
     WRAPPERS: ClassVar[tuple[type[VecEnv], ...]] = (ShownTaskVecEnv,)
-    ACTS_WITH: ClassVar[dict[str, Any]] = {"buffer_size": 1}
     FOLLOWS: ClassVar[dict[str, str]] = {
-        "train_freq": "a rollout is an episode of each env",
+        **OffPolicyRival.FOLLOWS,
         "replay_buffer_class": "replay is HER's",
         "optimize_memory_usage": "HER's replay does without",
     }
@@ -170,18 +141,15 @@ class SACHER(Rival, SAC):
         **kwargs: Any,
     ) -> None:
         check_numbers(gradient_steps=(gradient_steps, -1))
-        seed = self._check_settings(policy, seed, {**kwargs, "policy_kwargs": policy_kwargs})
         check_keywords("replay_buffer_kwargs", replay_buffer_kwargs or {}, HerReplayBuffer, without=GIVEN_BY_MODEL)
-        if isinstance(env, str):
-            env = make_task_vec_env(env, N_ENVS, seed)
         super().__init__(
-            policy=policy,
-            env=env,  # type: ignore[arg-type]
+            policy,
+            env,
+            seed,
             gradient_steps=gradient_steps,
             replay_buffer_kwargs=replay_buffer_kwargs,
             # SB3 adds to it, and what was given is the caller's, and in records
             policy_kwargs=dict(policy_kwargs or {}),
-            seed=seed,
             **kwargs,
         )
 
@@ -207,7 +175,6 @@ class SACHER(Rival, SAC):
         assert isinstance(env, ShownTaskVecEnv)
         check_rewards(env)
         self.shown = env.shown
-        self.train_freq = TrainFreq(get_max_episode_steps(env), TrainFrequencyUnit.STEP)  # type: ignore[assignment]
         if self._has_experience():
             assert isinstance(self.replay_buffer, TaskHerReplayBuffer)
             self.replay_buffer.env = env
@@ -254,23 +221,15 @@ class SACHER(Rival, SAC):
         self.replay_buffer.env = self.env  # which SB3 leaves out of copies
         self.replay_buffer.truncate_last_trajectory()
 
-    def collect_rollouts(self, env: VecEnv, callback: BaseCallback, *args: Any, **kwargs: Any) -> RolloutReturn:
-        """As SAC's, but logs are so many rollouts apart, and not episodes."""
-        kwargs.pop("log_interval", None)
-        rollout = super().collect_rollouts(env, callback, *args, **kwargs)
-        n_rollouts = self.num_timesteps // (self.n_envs * self.train_freq.frequency)  # type: ignore[union-attr]
-        if rollout.continue_training and self.logs_now(n_rollouts):
-            self.dump_logs()
-        return rollout
-
     def state_dict(self) -> dict[str, Any]:
         assert isinstance(self.replay_buffer, TaskHerReplayBuffer)
-        return {**super().state_dict(), "replay": self.replay_buffer.state_dict()}
+        state = super().state_dict()
+        return {**state, "replay": {**state["replay"], "begun": th.tensor(self.replay_buffer._current_ep_start)}}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         super().load_state_dict(state)
         assert isinstance(self.replay_buffer, TaskHerReplayBuffer)
-        self.replay_buffer.load_state_dict(state["replay"])
+        self.replay_buffer._current_ep_start = state["replay"]["begun"].cpu().numpy().copy()
 
     def _adaptation(self, n_envs: int, generator: th.Generator | None) -> Adapting:
         def act(obs: np.ndarray, tasks: np.ndarray, deterministic: bool) -> np.ndarray:

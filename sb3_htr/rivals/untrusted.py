@@ -8,6 +8,7 @@ import gymnasium as gym
 
 from sb3_htr.common.errors import OPEN_ERRORS, last_line
 from sb3_htr.common.plain import read_model
+from sb3_htr.common.settings import keywords_of
 from sb3_htr.rivals.base import Rival
 
 SelfRival = TypeVar("SelfRival", bound=Rival)
@@ -40,19 +41,13 @@ def load_untrusted(
     try:
         data, weights = read_model(path, ["policy"])
         n_steps = data["num_timesteps"]
-        # A copy, because SB3 adds to it
-        given = copy.deepcopy(hyperparams.get("policy_kwargs", {}))
-        policy_kwargs = {name: value for name, value in given.items() if name not in OF_TRAINING}
+        policy_kwargs = plain_policy(model_class, hyperparams)
         counts = {name: hyperparams[name] for name in model_class.ACTS_BY if name in hyperparams}
         if type(n_steps) is not int or not all(_is_plain(count, MAX_COUNT) for count in counts.values()):
             raise ValueError(f"it has {n_steps} env steps and the settings {counts}")
-        for name, value in policy_kwargs.items():
-            parts = value.values() if isinstance(value, dict) else [value]
-            if name not in NETWORKS or not all(_is_plain(part, NETWORKS[name]) for part in parts):
-                raise ValueError(
-                    f"its policy has {name}: {value}, which only --trust restores, and that may run code of the file"
-                )
-        settings = {**counts, **model_class.ACTS_WITH, "use_sde": hyperparams.get("use_sde") is True}
+        settings = {**counts, **model_class.ACTS_WITH}
+        if "use_sde" in keywords_of(model_class):
+            settings["use_sde"] = hyperparams.get("use_sde") is True
         model = model_class(model_class.DEFAULT_POLICY, env, device=device, policy_kwargs=policy_kwargs, **settings)
         model.policy.load_state_dict(weights["policy"])
     except OPEN_ERRORS:
@@ -62,6 +57,26 @@ def load_untrusted(
         raise ValueError(f"{path} is damaged, or no {model_class.__name__} with the settings of its record: {why}") from None
     model.num_timesteps = n_steps
     return model
+
+
+def plain_policy(model_class: type[Rival], hyperparams: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param model_class: of a model
+    :param hyperparams: of its training
+    :return: settings of its policy that make the same networks
+    :raises ValueError: if it has others than a file of unknown origin may have
+    """
+    if (policy := hyperparams.get("policy", model_class.DEFAULT_POLICY)) != model_class.DEFAULT_POLICY:
+        raise ValueError(f"its policy is {policy}, which only --trust restores, and that may run code of the file")
+    sizes = {**NETWORKS, **model_class.POLICY_SIZES}
+    # A copy, because SB3 adds to it
+    given = copy.deepcopy(hyperparams.get("policy_kwargs") or {})
+    plain = {name: value for name, value in given.items() if name not in OF_TRAINING}
+    for name, value in plain.items():
+        parts = value.values() if isinstance(value, dict) else [value]
+        if name not in sizes or not all(_is_plain(part, sizes[name]) for part in parts):
+            raise ValueError(f"its policy has {name}: {value}, which only --trust restores, and that may run code of the file")
+    return plain
 
 
 def _is_plain(value: Any, largest: int) -> bool:

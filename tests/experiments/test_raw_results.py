@@ -51,6 +51,7 @@ def test_a_method_of_ones_own_is_trained_alone_and_reported_beside_what_others_r
     assert trained == ["mine-seed1", "mine-seed2"]
     rows = json.loads(Path("results", "mine", "summary.json").read_text())["rows"]
     assert {(row["variant"], row["n_seeds"]) for row in rows} == {("htr-ser", 2), ("rl2", 2), ("pearl-sparse", 2), ("mine", 2)}
+    assert json.loads(Path("results/mine/summary.json").read_text())["command"].endswith("--seeds 2 --with-results published")
     raw, before = np.load("results/mine/raw-rl2.npz"), np.load(published / "raw-rl2.npz")
     assert {*raw.files} == {*before.files} and all((raw[key] == before[key]).all() for key in before.files)
 
@@ -74,7 +75,31 @@ def test_runs_of_something_else_are_not_taken(published: Path) -> None:
         raw_results.unpack(published, others, Path("runs"))
     with pytest.raises(ValueError, match=r"nowhere has no run of theirs: expected .* with runs such as htr-ser-seed1"):
         raw_results.unpack(Path("nowhere"), cells, Path("runs"))
+    others = [replace(cell, settings={"gamma": 0.5}) for cell in cells]
+    with pytest.raises(ValueError, match=r"htr-ser-seed1 in .* has settings {}, but theirs/.* needs {'gamma': 0.5}: leave"):
+        raw_results.unpack(published, others, Path("runs"))
     assert not Path("runs").exists(), "all or nothing"
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"cell": None}, r"htr-ser-seed1 in .* lacks \['cell'\], which theirs needs: leave the folder out"),
+        ({"hyperparams": None}, r"lacks \['hyperparams'\]"),
+        # As where a YAML file has changed since
+        ({"hyperparams": json.dumps({"gamma": 0.5})}, r"was trained with other \[.*'gamma'.*\] than theirs would: leave"),
+    ],
+)
+def test_runs_must_say_what_they_are_of(changed: dict[str, str | None], message: str, published: Path) -> None:
+    path = published / "raw-htr-ser.npz"
+    raw = dict(np.load(path))
+    for key, value in changed.items():
+        raw.pop(f"htr-ser-seed1/{key}")
+        if value is not None:
+            raw[f"htr-ser-seed1/{key}"] = np.array(value)
+    np.savez(path, **raw)
+    with pytest.raises(ValueError, match=message):
+        raw_results.unpack(published, grid.EXPERIMENTS["theirs"].cells(), Path("runs"))
 
 
 def test_results_do_not_replace_those_of_more_runs(published: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,8 +112,12 @@ def test_results_do_not_replace_those_of_more_runs(published: Path, monkeypatch:
     message = r"published has 5 runs that these results would not have, htr-ser-seed1 among them: name another folder with -o"
     with pytest.raises(ValueError, match=message):
         main(["experiment", "theirs", "--finished", "-o", "published"])
-    with pytest.raises(ValueError, match=r"has 3 runs .*, or keep what this one has with --with-results published, and"):
+    with pytest.raises(ValueError, match=r"has 3 runs .* are kept by --with-results published, and as many --seeds"):
         main(["experiment", "theirs", "--seeds", "1", "-o", "published"])
+    # Of the same names, and of other settings
+    with pytest.raises(ValueError, match=r"-seed\d in .* has (n_timesteps 480|eval_freq 240), but theirs/.*: name another"):
+        main(["experiment", "theirs", "--quick", "--seeds", "2", "-o", "published"])
     assert {path.name: path.read_bytes() for path in published.iterdir()} == before
     assert main(["experiment", "theirs", "--finished", "-o", "published", "--with-results", "published"]) == 0
-    assert {row["n_seeds"] for row in json.loads((published / "summary.json").read_text())["rows"]} == {2}
+    summary = json.loads((published / "summary.json").read_text())
+    assert {row["n_seeds"] for row in summary["rows"]} == {2} and summary["command"] == "sb3-htr experiment theirs --seeds 2"

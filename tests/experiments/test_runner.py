@@ -303,13 +303,15 @@ def test_results_of_what_is_finished_are_written_without_training(
     monkeypatch.setitem(grid.EXPERIMENTS, "pair", pair)
     monkeypatch.setattr("sb3_htr.experiments.driver.Driver", None)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(grid.EXPERIMENTS, "none", Experiment("none", "", ENV_ID, 480, (Variant("rl2"),), 1))
     with pytest.raises(ValueError, match=r"No run of pair is finished in .*runs: run it without --finished"):
         main(["experiment", "pair", "--finished"])
     assert not Path("results").exists()
     second = pair.cells()[1]
     second.result(Path("runs")).parent.mkdir(parents=True)
     made_up([second], second.result(Path("runs")).parent)
-    assert main(["experiment", "pair", "--finished"]) == 0
+    with pytest.raises(ValueError, match="No run of none is finished"):
+        main(["experiment", "none", "pair", "--finished"])
     assert "1 of 2 runs of pair are finished." in capsys.readouterr().out
     summary = json.loads(Path("results", "pair", "summary.json").read_text())
     assert {row["n_seeds"] for row in summary["rows"]} == {1} and summary["command"] == "sb3-htr experiment pair --seeds 2"

@@ -1,5 +1,6 @@
 """Raw results of experiments that nobody ran."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.protocol import EVAL_SEEDS
-from sb3_htr.experiments.runner import LOGGED
+from sb3_htr.experiments.runner import LOGGED, hyperparams_of
 
 
 def made_up(cells: list[Cell], folder: Path) -> dict[Cell, Path]:
@@ -20,6 +21,7 @@ def made_up(cells: list[Cell], folder: Path) -> dict[Cell, Path]:
             "solved": np.arange(20) < np.array([[0], [15], [16], [20]]),
             "elapsed_s": np.arange(1.0, 5.0),
         }
+        arrays["hyperparams"] = json.dumps(hyperparams_of(cell))
         arrays |= {"cell": cell.facts(), "commit": "abc", "evaluation_commit": "abc", **{key: 0.5 for key in LOGGED}}
         arrays["calibration"] = np.tile([[4.0, 1.0, 2.0]], (10, 1))
         for evaluation in cell.evaluations:

@@ -8,10 +8,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3 import PPO
+from stable_baselines3 import PPO, TD3
+from stable_baselines3.common.logger import Logger
 
 from helpers import ENV_ID
 from helpers.results import made_up
@@ -19,10 +21,14 @@ from helpers.runs import run_folder
 from sb3_htr import evaluate_adaptation
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.experiments import grid, report
+from sb3_htr.experiments.grid import Experiment, Variant
+from sb3_htr.experiments.runner import run_cell
+from sb3_htr.rivals.off_policy import OffPolicyRival
 from sb3_htr.rivals.rl2 import RL2
+from sb3_htr.rivals.untrusted import load_untrusted
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run import algorithm, method
-from sb3_htr.zoo.run.agents import RECORD, agent_at
+from sb3_htr.zoo.run.agents import RECORD, TrainedAgent, agent_at
 
 MODULE = "examples.plain_ppo"
 SMALL: dict[str, Any] = {"n_steps": 40, "batch_size": 40, "n_epochs": 1, "policy_kwargs": {"net_arch": [4]}}
@@ -84,12 +90,86 @@ def test_its_experiment_has_the_runs_of_the_others(tmp_path: Path, monkeypatch: 
     assert {row["variant"] for row in rows} == {variant.name or variant.method for variant in rivals.variants}
 
 
+class OwnTD3(OffPolicyRival, TD3):
+    """TD3 that is not told its task."""
+
+    DEFAULT_POLICY = "MlpPolicy"
+
+    def _adaptation(self, n_envs: int, generator: th.Generator | None) -> Any:
+        return importlib.import_module(MODULE).Unadapted(self.policy, n_envs)
+
+
+def own_td3(**kwargs: Any) -> OwnTD3:
+    env = make_task_vec_env(ENV_ID, 4, seed=0)
+    settings = {"policy_kwargs": {"net_arch": [4]}, "learning_starts": 100, "batch_size": 8, "gradient_steps": 2}
+    return OwnTD3("MlpPolicy", env, seed=0, **{**settings, **kwargs})
+
+
+def test_an_off_policy_rival_sees_whole_episodes_and_goes_on_exactly(tmp_path: Path) -> None:
+    """Its replay is in its checkpoints, also where it has begun anew."""
+    unbroken = own_td3(buffer_size=600).learn(960)
+    assert unbroken.replay_buffer is not None and unbroken.replay_buffer.full
+    # 150 of 240 steps of each env are kept, with seven or eight ends of episodes among them
+    assert unbroken.replay_buffer.dones.sum() in (28, 32)
+    assert np.abs(unbroken.replay_buffer.observations).max() > 0.3
+    state = copy.deepcopy(own_td3(buffer_size=600).learn(480).state_dict())
+    second = own_td3(buffer_size=600)
+    second.load_state_dict(state)
+    second.learn(480, reset_num_timesteps=False)
+    assert all(th.equal(value, second.policy.state_dict()[name]) for name, value in unbroken.policy.state_dict().items())
+    unbroken.save(tmp_path / "model.zip")
+    record = {"policy": "MlpPolicy", "policy_kwargs": {"net_arch": [4]}}
+    loaded = load_untrusted(OwnTD3, tmp_path / "model.zip", record, gym.make(ENV_ID), "cpu")
+    ours, theirs = (evaluate_adaptation(model, ENV_ID, n_episodes=1)[0] for model in (unbroken, loaded))
+    np.testing.assert_array_equal(ours, theirs)
+    with pytest.raises(ValueError, match="OwnTD3 has no setting 'train_freq': a rollout is an episode of each env"):
+        own_td3(train_freq=1)
+
+
+def test_rollouts_without_the_end_of_an_episode_are_refused(registered: Any) -> None:
+    with pytest.raises(ValueError, match="n_steps is 8, and episodes have up to 20 steps: give it as many or more"):
+        registered.PlainPPO("MlpPolicy", ENV_ID, n_steps=8)
+
+
+@pytest.mark.parametrize("log_interval", [None, 3])
+def test_logs_are_so_many_rollouts_apart(log_interval: int | None, registered: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    for make in (own_td3, lambda: registered.PlainPPO("MlpPolicy", make_task_vec_env(ENV_ID, 2, seed=0), **SMALL)):
+        logged: list[int] = []
+        monkeypatch.setattr(Logger, "dump", lambda logger, step=0, logged=logged: logged.append(step))
+        make().learn(480, log_interval=log_interval)
+        assert logged == ([] if log_interval is None else [240, 480])
+
+
+def test_what_could_not_be_evaluated_is_not_trained(registered: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Models of experiments are loaded as those of strangers are."""
+    monkeypatch.setattr("sb3_htr.experiments.runner.train.main", None)
+    variant = Variant("plain-ppo", settings={"policy_kwargs": {"latent_dim": 5}})
+    (cell,) = Experiment("one", "", ENV_ID, 480, (variant,), 1).cells()
+    message = r"-seed1 could not be evaluated: its policy has latent_dim: 5, .* name it in POLICY_SIZES of PlainPPO"
+    with pytest.raises(ValueError, match=message):
+        run_cell(cell, tmp_path)
+    monkeypatch.setattr(registered.PlainPPO, "POLICY_SIZES", {"latent_dim": 8})
+    with pytest.raises(TypeError, match="NoneType"):
+        run_cell(cell, tmp_path)
+
+
+def test_a_model_of_a_method_that_is_not_known_says_so(registered: Any, tmp_path: Path) -> None:
+    registered.PlainPPO("MlpPolicy", ENV_ID).save(tmp_path / "model.zip")
+    record = {"method": "unheard-of", "env_id": ENV_ID, "env_kwargs": {}, "hyperparams": {}}
+    with pytest.raises(ValueError, match="Nobody has registered the method 'unheard-of': is it of a module of yours"):
+        TrainedAgent(tmp_path / "model.zip", record, None).load()
+
+
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
         ({"name": "rl2"}, "There is an algorithm 'rl2' already"),
         ({"name": "my ppo"}, "The name of the algorithm is 'my ppo', expected one that can be the name of a folder"),
-        ({"model_class": PPO}, "PPO is no subclass of sb3_htr.rivals.base.Rival"),
+        ({"model_class": PPO}, r"PPO is no subclass of sb3_htr\.rivals\.on_policy\.OnPolicyRival or"),
+        (
+            {"model_class": type("Script", (RL2,), {"__module__": "__main__"})},
+            "Script is in a script, which nobody can",
+        ),
         ({"model_class": type("Inner", (RL2,), {"__qualname__": "outer.<locals>.Inner"})}, "put the class at the top"),
         ({"settings": "nowhere.yml"}, r"There is no file .*nowhere\.yml with hyperparameters of 'mine'"),
     ],

@@ -17,7 +17,8 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--env", required=True, metavar="ID", help="env of the agent")
     parser.add_argument("-orga", "--organization", required=True, metavar="USER", help="user or organization on the Hub")
     parser.add_argument("-name", "--repo-name", metavar="NAME", help="repository, by default ALGO-ID")
-    parser.add_argument("--algo", choices=list(ALGORITHMS), default="pearl", help="what trained it (default: pearl)")
+    algorithms = f"what trained it: {', '.join(ALGORITHMS)}, or one of your own (default: pearl)"
+    parser.add_argument("--algo", default="pearl", help=algorithms)
     parser.add_argument("-f", "--folder", type=Path, default=Path("logs"), help="log folder (default: logs)")
     args = parser.parse_args(argv)
     name = args.repo_name or model_name(args.env, args.algo)

@@ -94,6 +94,11 @@ class TrainedAgent:
         check_device(device)
         try:
             return self.algorithm.load(self.path, self.record, self.make_env(), device, self.trusted)
+        except ValueError as error:
+            if "method" not in self.record or self.method in methods():
+                raise
+            advice = "is it of a module of yours? --gym-packages names it."
+            raise ValueError(f"{error} Nobody has registered the method {self.method!r}: {advice}") from None
         except RuntimeError as error:
             writer = self.record.get("versions", {}).get("sb3_htr", "unknown")
             raise ValueError(

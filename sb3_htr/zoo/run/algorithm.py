@@ -10,6 +10,8 @@ import gymnasium as gym
 
 from sb3_htr.pearl import PEARL, load_untrusted
 from sb3_htr.rivals.base import Rival
+from sb3_htr.rivals.off_policy import OffPolicyRival
+from sb3_htr.rivals.on_policy import OnPolicyRival
 from sb3_htr.rivals.untrusted import load_untrusted as load_untrusted_rival
 from sb3_htr.zoo.run import search_space
 from sb3_htr.zoo.run.search_space import SearchSpace
@@ -118,14 +120,19 @@ def register_algorithm(
     :param settings: path of a YAML file with hyperparameters, as ``hyperparams/rl2.yml``
     :param about: how an agent of it comes to know its task, a sentence for model cards
     :param search_space: what ``optimize`` searches through, None for nothing
-    :raises ValueError: for a name that is taken or cannot be that of a folder, a class that is no rival or is within something
+    :raises ValueError: for a name that is taken or cannot be that of a folder, a class that is no rival or cannot be imported
     :raises FileNotFoundError: if there is no such file
     """
     check_folder_name("algorithm", name)
     if name in ALGORITHMS:
         raise ValueError(f"There is an algorithm {name!r} already: choose another name.")
-    if not issubclass(model_class, Rival):
-        raise ValueError(f"{model_class.__name__} is no subclass of sb3_htr.rivals.base.Rival, which says what is needed.")
+    if not issubclass(model_class, OnPolicyRival | OffPolicyRival):
+        raise ValueError(
+            f"{model_class.__name__} is no subclass of sb3_htr.rivals.on_policy.OnPolicyRival or "
+            "sb3_htr.rivals.off_policy.OffPolicyRival, which say what is needed."
+        )
+    if model_class.__module__ == "__main__":
+        raise ValueError(f"{model_class.__name__} is in a script, which nobody can import: put it into a module of its own.")
     path = Path(settings).resolve()
     if not path.is_file():
         raise FileNotFoundError(f"There is no file {path} with hyperparameters of {name!r}.")

@@ -1,0 +1,99 @@
+"""Rivals that learn from a replay."""
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn, TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_htr.common.checks import get_max_episode_steps
+from sb3_htr.rivals.base import Rival
+
+
+class OffPolicyRival(Rival, OffPolicyAlgorithm):
+    """
+    A mixin for off-policy algorithms of Stable-Baselines3. A rollout is one episode of each env, or as many steps where
+    episodes end early; ``gradient_steps`` updates follow, -1 for as many as it had env steps. Checkpoints have the replay.
+    """
+
+    ACTS_WITH: ClassVar[dict[str, Any]] = {"buffer_size": 1}
+    FOLLOWS: ClassVar[dict[str, str]] = {
+        "train_freq": "a rollout is an episode of each env",
+        "optimize_memory_usage": "a replay in a checkpoint does without",
+    }
+
+    def _setup_model(self) -> None:
+        if self.env is not None:
+            self._set_rollout(self.env)
+        super()._setup_model()
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        :param env: env of the same spaces and number of copies
+        :param force_reset: reset before training goes on
+        """
+        super().set_env(env, force_reset)
+        assert self.env is not None
+        self._set_rollout(self.env)
+
+    def _set_rollout(self, env: VecEnv) -> None:
+        self.train_freq = TrainFreq(get_max_episode_steps(env), TrainFrequencyUnit.STEP)  # type: ignore[assignment]
+
+    @property
+    def n_steps_per_rollout(self) -> int:
+        return self.train_freq.frequency * self.n_envs  # type: ignore[union-attr]
+
+    def collect_rollouts(self, env: VecEnv, callback: BaseCallback, *args: Any, **kwargs: Any) -> RolloutReturn:
+        """As the library's, but logs are so many rollouts apart, and not episodes."""
+        kwargs.pop("log_interval", None)
+        rollout = super().collect_rollouts(env, callback, *args, **kwargs)
+        if rollout.continue_training and self.logs_now():
+            self.dump_logs()
+        return rollout
+
+    def state_dict(self) -> dict[str, Any]:
+        assert self.replay_buffer is not None
+        return {**super().state_dict(), "replay": replay_state(self.replay_buffer)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        super().load_state_dict(state)
+        assert self.replay_buffer is not None
+        load_replay_state(self.replay_buffer, state["replay"])
+
+
+def replay_state(buffer: ReplayBuffer) -> dict[str, Any]:
+    """
+    :param buffer: of Stable-Baselines3
+    :return: what it stores, as tensors and numbers, for :func:`load_replay_state`
+    """
+    end = buffer.buffer_size if buffer.full else buffer.pos
+    arrays = {name: th.from_numpy(array[:end].copy()) for name, array in _arrays(buffer).items()}
+    return {"arrays": arrays, "pos": buffer.pos, "full": buffer.full}
+
+
+def load_replay_state(buffer: ReplayBuffer, state: dict[str, Any]) -> None:
+    """
+    :param buffer: with the settings of the one that the state is of
+    :param state: of :func:`replay_state`
+    """
+    for name, array in _arrays(buffer).items():
+        saved = state["arrays"][name].cpu().numpy()
+        array[: len(saved)] = saved
+    buffer.pos, buffer.full = state["pos"], state["full"]
+
+
+def _arrays(buffer: ReplayBuffer) -> dict[str, np.ndarray]:
+    """All of its arrays with a row for each step; those of dicts by two names. Infos are objects, and left out."""
+    named = dict(vars(buffer))
+    for name, value in vars(buffer).items():
+        if isinstance(value, dict):
+            named |= {f"{name}/{key}": array for key, array in value.items()}
+    return {
+        name: value
+        for name, value in named.items()
+        if isinstance(value, np.ndarray) and value.dtype != object and value.shape[:1] == (buffer.buffer_size,)
+    }
