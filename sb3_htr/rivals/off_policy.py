@@ -1,6 +1,7 @@
 """Rivals that learn from a replay."""
 
-from typing import Any, ClassVar
+import warnings
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
@@ -12,6 +13,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.common.checks import get_max_episode_steps
 from sb3_htr.rivals.base import Rival
+
+SelfOffPolicyRival = TypeVar("SelfOffPolicyRival", bound="OffPolicyRival")
 
 
 class OffPolicyRival(Rival, OffPolicyAlgorithm):
@@ -46,6 +49,17 @@ class OffPolicyRival(Rival, OffPolicyAlgorithm):
     @property
     def n_steps_per_rollout(self) -> int:
         return self.train_freq.frequency * self.n_envs  # type: ignore[union-attr]
+
+    def learn(self: SelfOffPolicyRival, total_timesteps: int, *args: Any, **kwargs: Any) -> SelfOffPolicyRival:
+        n_updates = self._n_updates
+        super().learn(total_timesteps, *args, **kwargs)
+        if self._n_updates == n_updates and total_timesteps > 0 and self.num_timesteps >= self._total_timesteps:
+            warnings.warn(
+                f"Nothing was learnt: learning begins after {self.learning_starts} env steps, and this training had "
+                f"{self.num_timesteps}. Allow more, or lower learning_starts.",
+                stacklevel=2,
+            )
+        return self
 
     def collect_rollouts(self, env: VecEnv, callback: BaseCallback, *args: Any, **kwargs: Any) -> RolloutReturn:
         """As the library's, but logs are so many rollouts apart, and not episodes."""

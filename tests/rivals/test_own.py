@@ -126,6 +126,13 @@ def test_an_off_policy_rival_sees_whole_episodes_and_goes_on_exactly(tmp_path: P
         own_td3(train_freq=1)
 
 
+def test_a_training_without_an_update_says_so() -> None:
+    with pytest.warns(
+        UserWarning, match="Nothing was learnt: learning begins after 1000 env steps, and this training had 160"
+    ):
+        own_td3(learning_starts=1000).learn(160)
+
+
 def test_rollouts_without_the_end_of_an_episode_are_refused(registered: Any) -> None:
     with pytest.raises(ValueError, match="n_steps is 8, and episodes have up to 20 steps: give it as many or more"):
         registered.PlainPPO("MlpPolicy", ENV_ID, n_steps=8)
