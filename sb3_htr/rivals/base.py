@@ -128,7 +128,9 @@ class Rival(CheckedFiles, Resumable):
 
     #: Policy of a file that does not say its own
     DEFAULT_POLICY: ClassVar[str]
-    #: What its ``_wrap_env`` puts around an env, to show the agent more than the env's observations
+    #: What its ``_wrap_env`` puts around an env, to show the agent more than the env's observations. It must leave an env of
+    #: this kind as it is, and widen ``terminal_observation``, too. At meta-test the env is not wrapped: what it shows more,
+    #: the adaptation adds itself, from the steps that it observes
     WRAPPERS: ClassVar[tuple[type[VecEnv], ...]] = ()
     #: Settings of its policy, whole numbers, beside those of SB3 and sb3-contrib, with the largest that a file may ask for
     POLICY_SIZES: ClassVar[dict[str, int]] = {}
@@ -146,6 +148,9 @@ class Rival(CheckedFiles, Resumable):
         :raises ValueError: for a setting that is unknown, or an env without tasks or time limit
         """
         seed = self._check_settings(policy, seed, kwargs)
+        if kwargs.get("policy_kwargs") is not None:
+            # SB3 adds to it, and what was given is the caller's, and in records
+            kwargs["policy_kwargs"] = dict(kwargs["policy_kwargs"])
         if isinstance(env, str):
             env = make_task_vec_env(env, N_ENVS, seed)
         super().__init__(policy=policy, env=env, seed=seed, **kwargs)

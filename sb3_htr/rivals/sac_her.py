@@ -148,8 +148,7 @@ class SACHER(OffPolicyRival, SAC):
             seed,
             gradient_steps=gradient_steps,
             replay_buffer_kwargs=replay_buffer_kwargs,
-            # SB3 adds to it, and what was given is the caller's, and in records
-            policy_kwargs=dict(policy_kwargs or {}),
+            policy_kwargs=policy_kwargs or {},
             **kwargs,
         )
 

@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3 import PPO, TD3
+from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.logger import Logger
 
 from helpers import ENV_ID
@@ -24,6 +24,7 @@ from sb3_htr.experiments import grid, report
 from sb3_htr.experiments.grid import Experiment, Variant
 from sb3_htr.experiments.runner import run_cell
 from sb3_htr.rivals.off_policy import OffPolicyRival
+from sb3_htr.rivals.on_policy import OnPolicyRival
 from sb3_htr.rivals.rl2 import RL2
 from sb3_htr.rivals.untrusted import load_untrusted
 from sb3_htr.zoo.cli import main
@@ -133,6 +134,25 @@ def test_a_training_without_an_update_says_so() -> None:
         own_td3(learning_starts=1000).learn(160)
 
 
+class OwnSAC(OffPolicyRival, SAC):
+    """Of a library's class that adds to the settings of its policy."""
+
+    DEFAULT_POLICY = "MlpPolicy"
+    _adaptation = OwnTD3._adaptation
+
+
+def test_settings_that_were_given_stay_as_they_are() -> None:
+    given: dict[str, Any] = {"net_arch": [4]}
+    OwnSAC("MlpPolicy", ENV_ID, policy_kwargs=given)
+    assert given == {"net_arch": [4]}
+
+
+def test_actions_that_are_not_scaled_are_refused(registered: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registered.Unadapted, "act", lambda adaptation, obs, deterministic: np.full((len(obs), 2), 3.0))
+    with pytest.raises(ValueError, match=r"Unadapted acts by \[3\.0, 3\.0\], expected numbers that are scaled to \[-1, 1\]"):
+        evaluate_adaptation(registered.PlainPPO("MlpPolicy", ENV_ID), ENV_ID, n_episodes=1)
+
+
 def test_rollouts_without_the_end_of_an_episode_are_refused(registered: Any) -> None:
     with pytest.raises(ValueError, match="n_steps is 8, and episodes have up to 20 steps: give it as many or more"):
         registered.PlainPPO("MlpPolicy", ENV_ID, n_steps=8)
@@ -173,6 +193,12 @@ def test_a_model_of_a_method_that_is_not_known_says_so(registered: Any, tmp_path
         ({"name": "rl2"}, "There is an algorithm 'rl2' already"),
         ({"name": "my ppo"}, "The name of the algorithm is 'my ppo', expected one that can be the name of a folder"),
         ({"model_class": PPO}, r"PPO is no subclass of sb3_htr\.rivals\.on_policy\.OnPolicyRival or"),
+        (
+            {"model_class": type("Bare", (OnPolicyRival, PPO), {"_adaptation": None})},
+            "Bare is not whole: it needs a DEFAULT_POLICY",
+        ),
+        ({"model_class": type("Mute", (OnPolicyRival, PPO), {"DEFAULT_POLICY": "MlpPolicy"})}, "Mute is not whole"),
+        ({"model_class": type("Turned", (PPO, OnPolicyRival), {})}, "Turned has PPO before its mixin: class Mine"),
         (
             {"model_class": type("Script", (RL2,), {"__module__": "__main__"})},
             "Script is in a script, which nobody can",

@@ -1,6 +1,7 @@
 """What the zoo has to know of an algorithm: where it is, what its settings are, and how a model of it is loaded."""
 
 import importlib
+import inspect
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -131,6 +132,12 @@ def register_algorithm(
             f"{model_class.__name__} is no subclass of sb3_htr.rivals.on_policy.OnPolicyRival or "
             "sb3_htr.rivals.off_policy.OffPolicyRival, which say what is needed."
         )
+    parts = model_class.__mro__
+    library = next(part for part in parts[1:] if part.__module__.startswith(("stable_baselines3.", "sb3_contrib.")))
+    if parts.index(library) < parts.index(Rival):
+        raise ValueError(f"{model_class.__name__} has {library.__name__} before its mixin: class Mine(OnPolicyRival, PPO).")
+    if inspect.isabstract(model_class) or not hasattr(model_class, "DEFAULT_POLICY"):
+        raise ValueError(f"{model_class.__name__} is not whole: it needs a DEFAULT_POLICY, and _adaptation.")
     if model_class.__module__ == "__main__":
         raise ValueError(f"{model_class.__name__} is in a script, which nobody can import: put it into a module of its own.")
     path = Path(settings).resolve()
