@@ -36,6 +36,20 @@ class Step(NamedTuple):
     infos: list[dict[str, Any]] = []  # noqa: RUF012 nobody writes to it
 
 
+def check_scaled(actions: np.ndarray) -> None:
+    """
+    :param actions: (n_envs, action_dim), of a step that an adaptation observes
+    :raises ValueError: if they are not in [-1, 1]
+    """
+    beyond = ~(np.abs(actions) <= 1 + 1e-5).all(axis=1)
+    if beyond.any():
+        env = int(beyond.argmax())
+        raise ValueError(
+            f"The actions of env {env} are {actions[env]}, expected numbers from -1 to 1: observe takes what act gave, which "
+            "policy.scale_action makes so, and the robot what unscale_action makes of it."
+        )
+
+
 class Adaptation:
     """
     Keeps the episodes of an adaptation and infers the posterior over z from those that the explorer wants in it.
@@ -135,7 +149,7 @@ class Adaptation:
             self._check("next_observations", step.next_observations, self.policy.obs_dim)
             self._check("actions", step.actions, self.policy.action_dim)
             self._check("dones", step.dones)
-            self._check_scaled(step.actions)
+            check_scaled(step.actions)
         self.task_reward = self._told(step) if self.is_training else self._learned(step)
         self._remember(step.observations, step.actions, step.rewards, self.task_reward)
         self.episode_return += self.task_reward
@@ -156,16 +170,6 @@ class Adaptation:
             raise ValueError(
                 f"The {name} of env {env} are {values[env]}, expected finite numbers up to {LARGEST:g}: they would be taken "
                 "for evidence. Begin a new Adaptation once the env is mended."
-            )
-
-    @staticmethod
-    def _check_scaled(actions: np.ndarray) -> None:
-        beyond = (np.abs(actions) > 1 + 1e-5).any(axis=1)
-        if beyond.any():
-            env = int(beyond.argmax())
-            raise ValueError(
-                f"The actions of env {env} are {actions[env]}, expected numbers from -1 to 1: observe takes what act gave, "
-                "and the robot what unscale_action makes of it."
             )
 
     @staticmethod

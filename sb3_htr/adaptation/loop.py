@@ -13,8 +13,6 @@ from sb3_htr.common.checks import get_max_episode_steps
 
 # An adaptation gives up after an episode of so many times those of training: an env that never ends one would hang
 ENDLESS = 10
-# Rounding apart
-LARGEST_ACTION = 1.0 + 1e-4
 # Functions of SB3's DummyVecEnv, and what an env returned that cannot be stored there
 NOT_STORED = {
     "_save_obs": "an env's observations must have the shape of its observation_space",
@@ -71,8 +69,8 @@ def adaptation_steps(
     :param obs: (n_envs, obs_dim) of that reset
     :param max_episode_steps: that episodes of training had; by default the time limit of the env
     :return: what each env did, step by step
-    :raises ValueError: for actions that are not scaled, an episode that does not end, an env that goes on to another task,
-        observations of another shape, rewards that are no numbers
+    :raises ValueError: for an episode that does not end, an env that goes on to another task, observations of another shape,
+        rewards that are no numbers
     """
     longest = ENDLESS * (get_max_episode_steps(env) if max_episode_steps is None else max_episode_steps)
     length = np.zeros(env.num_envs, dtype=np.int64)
@@ -82,12 +80,6 @@ def adaptation_steps(
     remaining = np.full(env.num_envs, n_episodes)
     while (remaining > 0).any():
         actions = act(obs)
-        if not np.abs(actions).max() <= LARGEST_ACTION:
-            largest = actions[np.abs(actions).max(axis=1).argmax()].tolist()
-            raise ValueError(
-                f"{type(adaptation).__name__} acts by {largest}, expected numbers that are scaled to [-1, 1], as by "
-                "policy.scale_action."
-            )
         new_obs, rewards, dones, infos = _step(env, unscale_action(actions))
         assert isinstance(new_obs, np.ndarray)
         next_obs = new_obs

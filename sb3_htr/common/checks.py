@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
@@ -48,6 +49,19 @@ def check_has_env(env: VecEnv | None) -> None:
     """
     if env is None:
         raise ValueError("The model was loaded without an env, which learning needs: pass env to load, or call set_env.")
+
+
+def warn_without_updates(model: OffPolicyAlgorithm, n_updates: int) -> None:
+    """
+    :param model: after a training; one that was stopped before its end may go on, and is no reason to warn
+    :param n_updates: that it had before
+    """
+    if model._n_updates == n_updates and model.num_timesteps >= model._total_timesteps:
+        warnings.warn(
+            f"Nothing was learnt: learning begins after {model.learning_starts} env steps, at the end of a rollout, and "
+            f"this training had {model.num_timesteps}. Allow more, or lower learning_starts.",
+            stacklevel=3,
+        )
 
 
 def check_spaces(env: GymEnv) -> None:

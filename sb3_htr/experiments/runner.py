@@ -136,7 +136,7 @@ def find_finished(cell: Cell, folder: Path) -> tuple[Path, Model] | None:
     for run in find_runs(folder) if any(folder.rglob(RECORD)) else ():
         record = read_record(run / RECORD)
         has = {**training_facts(record["hyperparams"], record["arguments"]), **{key: record[key] for key in OF_RUN}}
-        needs = planned(cell)
+        needs = _planned(cell)
         # What others follow from comes first
         for key in (*OF_RUN, *sorted({*has, *needs})):
             if has.get(key) != needs.get(key):
@@ -161,11 +161,8 @@ def hyperparams_of(cell: Cell) -> dict[str, Any]:
     return cast(dict[str, Any], json.loads(json.dumps(used, default=str)))  # which knows no tuples
 
 
-def planned(cell: Cell) -> dict[str, Any]:
-    """
-    :param cell: of an experiment
-    :return: what its training is, as its record will say it
-    """
+def _planned(cell: Cell) -> dict[str, Any]:
+    """What its training is, as its record will say it."""
     facts = {**training_facts(hyperparams_of(cell), cell.training(Path())), **{key: getattr(cell, key) for key in OF_RUN}}
     return cast(dict[str, Any], json.loads(json.dumps(facts, default=str)))
 

@@ -343,12 +343,8 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
             reset_num_timesteps=reset_num_timesteps,
             progress_bar=progress_bar,
         )
-        if self._n_updates == n_updates and total_timesteps > 0 and self.num_timesteps >= self._total_timesteps:
-            warnings.warn(
-                f"Nothing was learnt: learning begins after {self.learning_starts} env steps, at the end of a rollout, and "
-                f"this training had {self.num_timesteps}. Allow more, or lower learning_starts.",
-                stacklevel=2,
-            )
+        if total_timesteps > 0:
+            checks.warn_without_updates(self, n_updates)
         return self
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:

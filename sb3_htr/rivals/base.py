@@ -12,7 +12,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_htr.adaptation.adaptation import Step
+from sb3_htr.adaptation.adaptation import Step, check_scaled
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
 from sb3_htr.adaptation.loop import Adapting
 from sb3_htr.common.callback import followed_by, parts_of
@@ -64,7 +64,9 @@ class RivalAdaptation(ABC):
     def observe(self, step: Step) -> None:
         """
         :param step: what each env did
+        :raises ValueError: for actions that are not scaled
         """
+        check_scaled(step.actions)
         if step.infos:
             self._found |= [bool(info.get("is_success", False)) for info in step.infos]
 

@@ -1,6 +1,5 @@
 """Rivals that learn from a replay."""
 
-import warnings
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -11,7 +10,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_htr.common.checks import get_max_episode_steps
+from sb3_htr.common.checks import get_max_episode_steps, warn_without_updates
 from sb3_htr.rivals.base import Rival
 
 SelfOffPolicyRival = TypeVar("SelfOffPolicyRival", bound="OffPolicyRival")
@@ -53,12 +52,8 @@ class OffPolicyRival(Rival, OffPolicyAlgorithm):
     def learn(self: SelfOffPolicyRival, total_timesteps: int, *args: Any, **kwargs: Any) -> SelfOffPolicyRival:
         n_updates = self._n_updates
         super().learn(total_timesteps, *args, **kwargs)
-        if self._n_updates == n_updates and total_timesteps > 0 and self.num_timesteps >= self._total_timesteps:
-            warnings.warn(
-                f"Nothing was learnt: learning begins after {self.learning_starts} env steps, and this training had "
-                f"{self.num_timesteps}. Allow more, or lower learning_starts.",
-                stacklevel=2,
-            )
+        if total_timesteps > 0:
+            warn_without_updates(self, n_updates)
         return self
 
     def collect_rollouts(self, env: VecEnv, callback: BaseCallback, *args: Any, **kwargs: Any) -> RolloutReturn:
