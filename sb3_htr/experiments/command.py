@@ -44,6 +44,7 @@ def main(argv: Sequence[str]) -> None:
         report.check(finished([cell for cell in cells if cell in of_command], runs))
         if not args.finished and args.cell is None:
             raw_results.check_none_lost(outputs[name], cells)
+    failed: ValueError | None = None
     if not args.finished:
         here = executors.Here() if args.cell is not None else executors.Processes(args.jobs)
         try:
@@ -51,24 +52,32 @@ def main(argv: Sequence[str]) -> None:
         except KeyboardInterrupt:
             print(f"\nStopped. What ran goes on from its checkpoint in {runs} with the same command.", file=sys.stderr)
             raise SystemExit(130) from None
-    if args.cell is not None:
-        return
-    results = {name: finished(cells, runs) for name, cells in grids.items()}
+        except ValueError as error:
+            # Experiments whose cells are all done have their results before it is raised
+            failed = error
+    results = {} if args.cell is not None else {name: finished(cells, runs) for name, cells in grids.items()}
     for name, done in results.items():
         print(f"{len(done)} of {len(grids[name])} runs of {name} are finished.")
-        if not done:
+        if not done or (failed and len(done) < len(grids[name])):
             continue
-        how = ("--quick " if args.quick else "") + f"--seeds {len({cell.seed for cell in grids[name]})}"
-        how += f" --gym-packages {' '.join(args.gym_packages)}" if args.gym_packages else ""
-        # Those of its own folder are runs of the experiment, made by this command before
-        others = [str(folder) for folder in args.with_results if folder.resolve() != outputs[name].resolve()]
-        how += f" --with-results {' '.join(others)}" if others else ""
-        report.write(f"sb3-htr experiment {name} {how}", grid.EXPERIMENTS[name], done, outputs[name])
+        report.write(_command(args, grids[name], outputs[name]), grid.EXPERIMENTS[name], done, outputs[name])
         print(f"Results: {outputs[name]}")
+    if failed:
+        raise failed
     if nothing := [name for name, done in results.items() if not done]:
         raise ValueError(
             f"No run of {' and of '.join(nothing)} is finished in {runs}: run it without --finished, or name other --runs."
         )
+
+
+def _command(args: argparse.Namespace, cells: Sequence[Cell], output: Path) -> str:
+    """What repeats all runs of an experiment."""
+    how = ("--quick " if args.quick else "") + f"--seeds {len({cell.seed for cell in cells})}"
+    how += f" --gym-packages {' '.join(args.gym_packages)}" if args.gym_packages else ""
+    # Those of its own folder are runs of the experiment, made by this command before
+    others = [str(folder) for folder in args.with_results if folder.resolve() != output.resolve()]
+    how += f" --with-results {' '.join(others)}" if others else ""
+    return f"sb3-htr experiment {cells[0].experiment} {how}"
 
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:

@@ -296,6 +296,30 @@ def test_one_command_runs_several_experiments(tmp_path: Path, monkeypatch: pytes
         main(["experiment", "near", "far", "--with-results", "both/near"])
 
 
+def test_an_experiment_that_is_whole_is_reported_whatever_others_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def train(cell: Cell, runs: Path) -> bool:
+        if cell.name == "htr-ser-seed2":
+            raise RuntimeError("no luck")
+        cell.result(runs).parent.mkdir(parents=True, exist_ok=True)
+        made_up([cell], cell.result(runs).parent)
+        return True
+
+    for name, n_seeds in (("broken", 2), ("whole", 1)):
+        experiment = Experiment(name, "", ENV_ID, 480, (Variant("htr-ser"),), n_seeds, evaluations=by(("prior",)))
+        monkeypatch.setitem(grid.EXPERIMENTS, name, experiment)
+    monkeypatch.setattr("sb3_htr.experiments.driver.run_cell", train)
+    monkeypatch.setattr("sb3_htr.experiments.executors.Processes", lambda _: Here())
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=r"1 of 3 cells failed 3 times .*no luck"):
+        main(["experiment", "broken", "whole"])
+    assert "1 of 2 runs of broken are finished." in capsys.readouterr().out
+    assert Path("results", "whole", "summary.json").exists() and not Path("results", "broken").exists()
+    with pytest.raises(ValueError, match="no luck"):
+        main(["experiment", "broken", "--cell", "1"])
+
+
 def test_results_of_what_is_finished_are_written_without_training(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
