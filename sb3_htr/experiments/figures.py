@@ -39,7 +39,7 @@ def by_variant(results: Results, and_env: bool = True) -> dict[str, list[tuple[C
 def n_seeds(results: Results) -> int:
     """
     :param results: raw results of the cells
-    :return: runs of each variant
+    :return: seeds of them all; a variant may have fewer runs
     """
     return len({cell.seed for cell in results})
 
@@ -99,8 +99,8 @@ def learning(results: Results, path: Path) -> None:
 
 def race(results: Results, path: Path) -> None:
     """
-    Validation tasks solved during meta-training, over env steps and over the minutes that these and the updates took in the
-    median run.
+    Validation tasks solved during meta-training, over env steps and over the minutes that these, updates and evaluations took
+    in the median run.
 
     :param results: raw results of the cells
     :param path: picture to write
