@@ -174,7 +174,9 @@ class Adaptation:
 
     @staticmethod
     def _told(step: Step) -> np.ndarray:
-        return task_reward(step.rewards, np.array([info.get("task_free_reward", 0.0) for info in step.infos]))
+        # In the replay's type: what differs by rounding alone is no reward
+        task_free = np.array([info.get("task_free_reward", 0.0) for info in step.infos], dtype=np.float32)
+        return task_reward(np.asarray(step.rewards, dtype=np.float32), task_free)
 
     def _learned(self, step: Step) -> np.ndarray:
         policy, device = self.policy, self.policy.device

@@ -15,7 +15,7 @@ from sb3_htr.common.checks import check_is_env, get_task_family
 from sb3_htr.common.random_state import MAX_SEED, kept_env_states, seeded_actions
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.type_aliases import TaskFamily
-from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env, reset_to_tasks
+from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env, reset_to_tasks, seed_envs
 
 #: Sets of tasks that a family has
 TASK_SETS = ("test", "validation", "train")
@@ -187,7 +187,7 @@ def record_adaptation(
     records = []
     # It may be the env of training
     with kept_env_states(env):
-        env.seed(seed)
+        seed_envs(env, seed)
         for first in range(0, len(tasks), env.num_envs):
             # Envs without a task of their own repeat the last one
             index = np.minimum(np.arange(first, first + env.num_envs), len(tasks) - 1)

@@ -143,6 +143,20 @@ def set_tasks(env: VecEnv, task_ids: np.ndarray | None, indices: np.ndarray) -> 
             env.env_method("set_task", None if task_ids is None else int(task_ids[i]), indices=int(index))
 
 
+def seed_envs(env: VecEnv, seed: int | None) -> Sequence[int | None]:
+    """
+    Of SB3's envs, number i has the seed ``seed + i``, so that runs and evaluations of consecutive seeds would share all of
+    them but one. Here only the first one has a seed that others could have, its own.
+
+    :param env: VecEnv
+    :param seed: of the first env
+    :return: seeds of all
+    """
+    seeds = env.seed(seed)
+    env.unwrapped._seeds = [seeds[0], *np.random.SeedSequence(seeds[0]).generate_state(env.num_envs)[1:].tolist()]
+    return env.unwrapped._seeds
+
+
 class PatientResultsWriter(ResultsWriter):
     """Writes SB3's monitor file as long as that is possible: a disk that is full stops no training."""
 
@@ -173,16 +187,10 @@ class TaskVecMonitor(CopiedWrapper, VecMonitor):
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """
-        Of SB3's envs, number i has the seed ``seed + i``, so that runs and evaluations of consecutive seeds would share all of
-        them but one. Here only the first one has a seed that others could have, its own.
-
-        :param seed: of the first env
+        :param seed: see :func:`seed_envs`
         :return: seeds of all
         """
-        seeds = self.venv.seed(seed)
-        env = self.venv.unwrapped
-        env._seeds = [seeds[0], *np.random.SeedSequence(seeds[0]).generate_state(self.num_envs)[1:].tolist()]
-        return env._seeds
+        return seed_envs(self.venv, seed)
 
     def step_wait(self) -> VecEnvStepReturn:
         try:

@@ -49,7 +49,7 @@ def calibration(model: Model, env_id: str, env_kwargs: KwArgs, n_episodes: int) 
         episodes = np.split(np.arange(dones.shape[1]), np.flatnonzero(dones[task]) + 1)
         best = max(episodes, key=lambda episode: gains[task, episode].sum())
         if success[task, task, best].any():
-            taken, lengths = evenly_spread(np.array([len(best)]), model.context_size)
+            taken, lengths = evenly_spread(np.array([len(best)]), model.context_size, gains[task, best])
             o, a, r = (th.as_tensor(x[task, best[taken]], dtype=th.float32) for x in (obs, actions, rewards))
             with th.no_grad():
                 means.append(policy.infer(Context(o, a, r, th.as_tensor(lengths)))[0])

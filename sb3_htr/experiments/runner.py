@@ -10,6 +10,7 @@ import yaml
 from filelock import Timeout
 
 import htr_envs  # noqa: F401 registers the envs
+from sb3_htr.adaptation.explorers import to_explorer
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.resume import checkpoints
@@ -17,6 +18,7 @@ from sb3_htr.common.versions import commit, named, processor
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.log import logged
 from sb3_htr.experiments.protocol import evaluate
+from sb3_htr.pearl.untrusted import EXPLORERS, check_is_ours
 from sb3_htr.rivals.base import Rival
 from sb3_htr.rivals.untrusted import plain_policy
 from sb3_htr.zoo.commands import train
@@ -169,10 +171,13 @@ def _planned(cell: Cell) -> dict[str, Any]:
 
 def _check_loadable(cell: Cell) -> None:
     """Before it is trained: its model will be loaded as those of strangers are."""
-    model_class = get_method(cell.method).algorithm.model_class()
-    if issubclass(model_class, Rival):
-        try:
-            plain_policy(model_class, hyperparams_of(cell))
-        except ValueError as error:
+    model_class, settings = get_method(cell.method).algorithm.model_class(), hyperparams_of(cell)
+    advice = "Leave it out."
+    try:
+        if issubclass(model_class, Rival):
             advice = f"Leave it out, or name it in POLICY_SIZES of {model_class.__name__}."
-            raise ValueError(f"{cell.label} could not be evaluated: {error}. {advice}") from None
+            plain_policy(model_class, settings)
+        for name in [name for name in EXPLORERS if name in settings]:
+            check_is_ours(name, type(to_explorer(settings[name])).__module__)
+    except ValueError as error:
+        raise ValueError(f"{cell.label} could not be evaluated: {error.args[0].rstrip('.')}. {advice}") from None

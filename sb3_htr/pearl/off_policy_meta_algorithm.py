@@ -42,7 +42,7 @@ from sb3_htr.common.random_state import (
 from sb3_htr.common.saving import CheckedFiles, with_suffix
 from sb3_htr.common.settings import check_keywords, check_numbers, plain
 from sb3_htr.common.training_state import Resumable
-from sb3_htr.common.vec_env import in_float32, make_task_vec_env
+from sb3_htr.common.vec_env import in_float32, make_task_vec_env, seed_envs
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.htr.reward_hook import check_reward_hook
 from sb3_htr.pearl.horizon import BY_HORIZON, STEPS_PER_UPDATE, complete, timesteps_for
@@ -297,6 +297,8 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         :param seed: seed of python, numpy, torch, envs, rollout tasks, replay buffer and task bank
         """
         super().set_random_seed(seed)
+        if self.env is not None and seed is not None:
+            seed_envs(self.env, seed)
         self._rng = stream(seed, "rollouts")
         if isinstance(self.replay_buffer, MultiTaskReplayBuffer) and seed is not None:
             self.replay_buffer.seed(seed)

@@ -51,8 +51,8 @@ class PEARL(OffPolicyMetaAlgorithm):
     :param batch_size: transitions per task for actor and critics, fewer where fewer are at hand, an episode or 24 by default
         (PEARL's reference: 256)
     :param tau: soft update of the target critics, in (0, 1] (PEARL's reference: 0.005)
-    :param gamma: discount in [0, 1], 1 - 2 / T for T steps of an episode by default, within 0.5 and 0.98 (PEARL's
-        reference for the sparse point robot: 0.9, which it is there)
+    :param gamma: discount in [0, 1], 1 - 2 / T for T steps of an episode by default, within 0.5 and 0.98, 0 for T of 1
+        (PEARL's reference for the sparse point robot: 0.9, which it is there)
     :param n_steps: steps whose rewards a return counts before the critics' value is asked for. Values reach further back with
         each update, but what was done in these steps counts, whatever the task that it was done for: by measurement, 3 is
         better than 5 on the ant. By default one for every 60 steps of an episode, from 1 to 10 (PEARL's reference: 1)

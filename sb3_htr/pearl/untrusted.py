@@ -66,7 +66,7 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
     path = path if os.path.exists(path) else with_suffix(path, ".zip")
     try:
         data, weights = read_model(path, ("policy", "knowledge"))
-        _check_is_ours("policy", data["policy_class"].get("__module__", ""))
+        check_is_ours("policy", data["policy_class"].get("__module__", ""))
         settings: dict[str, Any] = {name: _plain(name, data[name]) for name in EXPLORERS if name not in kwargs}
         settings |= {name: data[name] for name in NUMBERS if type(data.get(name)) in (int, float)}
         # A schedule may be one that is read below; no other number is an object
@@ -106,13 +106,18 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
     return model
 
 
-def _check_is_ours(what: str, module: str) -> None:
+def check_is_ours(what: str, module: str) -> None:
+    """
+    :param what: class of a model is meant
+    :param module: that it is in
+    :raises Refused: if that is none of this package
+    """
     if not module.startswith("sb3_htr."):
         raise Refused(f"its {what} is a class of its own, which only PEARL.load restores, and that may run code of the file.")
 
 
 def _plain(what: str, explorer: dict[str, Any]) -> dict[str, Any]:
-    _check_is_ours(what, explorer.get(TYPE, "").removeprefix("<class '"))
+    check_is_ours(what, explorer.get(TYPE, "").removeprefix("<class '"))
     settings = {key: value for key, value in explorer.items() if key not in (TYPE, PICKLED)}
     name = settings.get("name")
     if not isinstance(name, str) or name not in explorers.EXPLORERS:

@@ -7,6 +7,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import check_for_correct_spaces
@@ -16,12 +17,12 @@ from sb3_htr.adaptation.adaptation import Step, check_scaled
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
 from sb3_htr.adaptation.loop import Adapting
 from sb3_htr.common.callback import followed_by, parts_of
-from sb3_htr.common.checks import check_device, check_has_env, check_is_not_normalized
+from sb3_htr.common.checks import check_device, check_has_env, check_is_env, check_is_not_normalized, get_task_family
 from sb3_htr.common.random_state import checked_seed
 from sb3_htr.common.saving import CheckedFiles
 from sb3_htr.common.settings import check_keywords, check_numbers
 from sb3_htr.common.training_state import Resumable
-from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
+from sb3_htr.common.vec_env import N_ENVS, in_float32, make_task_vec_env, seed_envs, set_tasks
 
 SelfRival = TypeVar("SelfRival", bound="Rival")
 
@@ -139,6 +140,7 @@ class Rival(CheckedFiles, Resumable):
     #: Settings, whole numbers, that an agent which is loaded to act has of its training, and those that it has in their place
     ACTS_BY: ClassVar[tuple[str, ...]] = ()
     ACTS_WITH: ClassVar[dict[str, Any]] = {}
+    FOLLOWS: ClassVar[dict[str, str]] = {"use_sde": "its noise is drawn before a rollout, and in no checkpoint"}
     explorer = OwnWay()
 
     def __init__(self, policy: Any, env: GymEnv | str | None, seed: int | None = None, **kwargs: Any) -> None:
@@ -172,6 +174,22 @@ class Rival(CheckedFiles, Resumable):
             check_keywords("policy_kwargs", settings.get("policy_kwargs") or {}, policy_class)
         return checked_seed(seed)
 
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        check_is_env(env)
+        vec_env = in_float32(BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper))
+        check_is_not_normalized(vec_env)
+        get_task_family(vec_env)
+        return vec_env
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """
+        :param seed: seed of python, numpy, torch and envs
+        """
+        super().set_random_seed(seed)
+        if self.env is not None and seed is not None:
+            seed_envs(self.env, seed)
+
     @abstractmethod
     def _adaptation(self, n_envs: int, generator: th.Generator | None) -> Adapting:
         """An adaptation to so many tasks, side by side."""
@@ -201,8 +219,9 @@ class Rival(CheckedFiles, Resumable):
         check_for_correct_spaces(self._wrap_env(env), self.observation_space, self.action_space)
 
     def begin_rollout(self) -> None:
-        """Begin new episodes in all envs."""
+        """Begin new episodes in all envs, on training tasks: an evaluation may have left others."""
         assert self.env is not None
+        set_tasks(self.env, None, np.arange(self.env.num_envs))
         self._last_obs = self.env.reset()  # type: ignore[assignment]
         self._last_episode_starts = np.ones(self.env.num_envs, dtype=bool)
 

@@ -24,6 +24,7 @@ class OffPolicyRival(Rival, OffPolicyAlgorithm):
 
     ACTS_WITH: ClassVar[dict[str, Any]] = {"buffer_size": 1}
     FOLLOWS: ClassVar[dict[str, str]] = {
+        **Rival.FOLLOWS,
         "train_freq": "a rollout is an episode of each env",
         "optimize_memory_usage": "a replay in a checkpoint does without",
     }
@@ -64,6 +65,13 @@ class OffPolicyRival(Rival, OffPolicyAlgorithm):
             self.dump_logs()
         return rollout
 
+    def begin_rollout(self) -> None:
+        super().begin_rollout()
+        assert self.replay_buffer is not None
+        end_episodes(self.replay_buffer)
+        if self.action_noise is not None:
+            self.action_noise.reset()
+
     def state_dict(self) -> dict[str, Any]:
         assert self.replay_buffer is not None
         return {**super().state_dict(), "replay": replay_state(self.replay_buffer)}
@@ -72,6 +80,17 @@ class OffPolicyRival(Rival, OffPolicyAlgorithm):
         super().load_state_dict(state)
         assert self.replay_buffer is not None
         load_replay_state(self.replay_buffer, state["replay"])
+
+
+def end_episodes(buffer: ReplayBuffer) -> None:
+    """
+    Cut short the episodes that are not complete, because all envs are reset: returns of several steps end there.
+
+    :param buffer: of Stable-Baselines3
+    """
+    if buffer.size() > 0:
+        buffer.timeouts[buffer.pos - 1] = np.maximum(buffer.timeouts[buffer.pos - 1], 1 - buffer.dones[buffer.pos - 1])
+        buffer.dones[buffer.pos - 1] = 1
 
 
 def replay_state(buffer: ReplayBuffer) -> dict[str, Any]:

@@ -12,9 +12,9 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.adaptation import Step
 from sb3_htr.adaptation.loop import Adapting
-from sb3_htr.common.checks import check_is_env, check_is_not_normalized, get_max_episode_steps
+from sb3_htr.common.checks import get_max_episode_steps
 from sb3_htr.common.settings import check_numbers
-from sb3_htr.common.vec_env import N_ENVS, in_float32, make_task_vec_env
+from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
 from sb3_htr.rivals.base import RivalAdaptation
 from sb3_htr.rivals.on_policy import OnPolicyRival
 from sb3_htr.rivals.trial_policy import TrialLstmPolicy
@@ -88,7 +88,10 @@ class RL2(OnPolicyRival, RecurrentPPO):
     WRAPPERS: ClassVar[tuple[type[VecEnv], ...]] = (TrialVecEnv,)
     ACTS_BY: ClassVar[tuple[str, ...]] = ("n_episodes_per_trial",)
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpLstmPolicy": TrialLstmPolicy}
-    FOLLOWS: ClassVar[dict[str, str]] = {"n_steps": "it follows from n_trials_per_rollout, as a rollout is whole trials"}
+    FOLLOWS: ClassVar[dict[str, str]] = {
+        **OnPolicyRival.FOLLOWS,
+        "n_steps": "it follows from n_trials_per_rollout, as a rollout is whole trials",
+    }
     policy: RecurrentActorCriticPolicy
     env: TrialVecEnv | None
 
@@ -103,18 +106,11 @@ class RL2(OnPolicyRival, RecurrentPPO):
     ) -> None:
         check_numbers(n_episodes_per_trial=(n_episodes_per_trial, 1), n_trials_per_rollout=(n_trials_per_rollout, 1))
         seed = self._check_settings(policy, seed, kwargs)
-        if isinstance(env, TrialVecEnv) and env.n_episodes != n_episodes_per_trial:
-            raise ValueError(
-                f"This env has trials of {env.n_episodes} episodes, as another model asked for, and n_episodes_per_trial is "
-                f"{n_episodes_per_trial}: pass an env of its own, or its id."
-            )
         if isinstance(env, str):
             env = make_task_vec_env(env, N_ENVS, seed)
         n_steps = 1
         if env is not None:
-            env = self._wrap_env(env)
-            assert isinstance(env, TrialVecEnv)
-            env.n_episodes = n_episodes_per_trial
+            env = self._in_trials(self._wrap_env(env), n_episodes_per_trial)
             n_steps = n_trials_per_rollout * env.max_trial_steps
             # Gradients go through a minibatch, in the order of its steps, and no further
             kwargs.setdefault("batch_size", N_TRIALS_PER_BATCH * env.max_trial_steps)
@@ -127,10 +123,13 @@ class RL2(OnPolicyRival, RecurrentPPO):
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         if isinstance(env, TrialVecEnv):
             return env
-        check_is_env(env)
-        vec_env = in_float32(RecurrentPPO._wrap_env(env, verbose, monitor_wrapper))
-        check_is_not_normalized(vec_env)
-        return TrialVecEnv(vec_env, N_EPISODES_PER_TRIAL)
+        return TrialVecEnv(OnPolicyRival._wrap_env(env, verbose, monitor_wrapper), N_EPISODES_PER_TRIAL)
+
+    @staticmethod
+    def _in_trials(env: VecEnv, n_episodes: int) -> TrialVecEnv:
+        """Of its own, as other models may have the same env, and trials of another length."""
+        assert isinstance(env, TrialVecEnv)
+        return TrialVecEnv(env.venv, n_episodes)
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -150,7 +149,7 @@ class RL2(OnPolicyRival, RecurrentPPO):
     def _set_trials(self) -> None:
         if self.env is not None:
             self._check_time_limit(self.env)
-            self.env.n_episodes = self.n_episodes_per_trial
+            self.env = self._in_trials(self.env, self.n_episodes_per_trial)
 
     def _check_time_limit(self, env: VecEnv) -> None:
         n_steps = self.n_trials_per_rollout * self.n_episodes_per_trial * get_max_episode_steps(env)

@@ -19,7 +19,6 @@ from stable_baselines3.sac.policies import MultiInputPolicy, SACPolicy
 from sb3_htr.adaptation.loop import Adapting
 from sb3_htr.common.checks import (
     check_has_env,
-    check_is_env,
     check_rewards,
     check_same_family,
     family_facts,
@@ -28,7 +27,6 @@ from sb3_htr.common.checks import (
 )
 from sb3_htr.common.settings import check_keywords, check_numbers
 from sb3_htr.common.type_aliases import Trajectory
-from sb3_htr.common.vec_env import in_float32
 from sb3_htr.htr.reward_hook import check_rewards_told
 from sb3_htr.rivals.base import ToldAdaptation, unscaled
 from sb3_htr.rivals.off_policy import OffPolicyRival
@@ -156,8 +154,7 @@ class SACHER(OffPolicyRival, SAC):
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         if isinstance(env, ShownTaskVecEnv):
             return env
-        check_is_env(env)
-        return ShownTaskVecEnv(in_float32(SAC._wrap_env(env, verbose, monitor_wrapper)))
+        return ShownTaskVecEnv(OffPolicyRival._wrap_env(env, verbose, monitor_wrapper))
 
     def _setup_model(self) -> None:
         self._check_policy_class()

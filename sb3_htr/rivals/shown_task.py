@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 
 from sb3_htr.common.checks import check_has_hooks, check_spaces, get_task_family
 from sb3_htr.common.type_aliases import TaskFamily, Trajectory
-from sb3_htr.common.vec_env import CopiedWrapper, set_tasks
+from sb3_htr.common.vec_env import CopiedWrapper
 
 
 class ShownTask:
@@ -70,8 +70,7 @@ class ShownTaskVecEnv(CopiedWrapper):
         return np.stack(self.venv.get_attr("task"))
 
     def reset(self) -> VecEnvObs:
-        """Begin an episode in each env, on a training task that it draws."""
-        set_tasks(self.venv, None, np.arange(self.num_envs))
+        """Begin an episode in each env."""
         obs = self.venv.reset()
         assert isinstance(obs, np.ndarray)
         self._now = self._tasks()

@@ -8,7 +8,6 @@ import gymnasium as gym
 
 from sb3_htr.common.errors import OPEN_ERRORS, last_line
 from sb3_htr.common.plain import read_model
-from sb3_htr.common.settings import keywords_of
 from sb3_htr.rivals.base import Rival
 
 SelfRival = TypeVar("SelfRival", bound=Rival)
@@ -16,7 +15,7 @@ SelfRival = TypeVar("SelfRival", bound=Rival)
 MAX_LAYERS, MAX_UNITS = 4, 1024
 # What a file may say of networks, with the largest number for each
 NETWORKS = {"net_arch": MAX_UNITS, "lstm_hidden_size": MAX_UNITS, "n_lstm_layers": MAX_LAYERS}
-NETWORKS |= dict.fromkeys(("shared_lstm", "enable_critic_lstm", "use_sde"), 1)
+NETWORKS |= dict.fromkeys(("shared_lstm", "enable_critic_lstm"), 1)
 # What says how weights begin and how they are learnt, and nothing of those in a file
 OF_TRAINING = ("log_std_init", "ortho_init", "optimizer_kwargs")
 # The largest number of what else it may say
@@ -46,8 +45,6 @@ def load_untrusted(
         if type(n_steps) is not int or not all(_is_plain(count, MAX_COUNT) for count in counts.values()):
             raise ValueError(f"it has {n_steps} env steps and the settings {counts}")
         settings = {**counts, **model_class.ACTS_WITH}
-        if "use_sde" in keywords_of(model_class):
-            settings["use_sde"] = hyperparams.get("use_sde") is True
         model = model_class(model_class.DEFAULT_POLICY, env, device=device, policy_kwargs=policy_kwargs, **settings)
         model.policy.load_state_dict(weights["policy"])
     except OPEN_ERRORS:

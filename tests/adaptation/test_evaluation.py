@@ -16,10 +16,41 @@ from helpers.adaptations import know_tasks
 from htr_envs import DynamicsVectorEnv, PointRobotFamily
 from htr_envs.point_robot import PointRobotDynamics
 from sb3_htr import PEARL, evaluate_adaptation
-from sb3_htr.adaptation import Belief, Prior, evaluation
+from sb3_htr.adaptation import Adaptation, Belief, Prior, Step, evaluation
 from sb3_htr.adaptation.evaluation import record_adaptation
 from sb3_htr.common.random_state import get_env_states
-from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
+from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env, reset_to_tasks
+from sb3_htr.rivals.scripted import ScriptedAgent
+
+
+def test_evaluations_and_trainings_of_consecutive_seeds_share_no_env(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Envs that a user made, too."""
+    starts: list[np.ndarray] = []
+
+    def remembered(env: VecEnv, tasks: np.ndarray) -> np.ndarray:
+        starts.append(obs := reset_to_tasks(env, tasks))
+        return obs
+
+    monkeypatch.setattr(evaluation, "reset_to_tasks", remembered)
+    env = DummyVecEnv([lambda: gym.make("SparseWheeled-v0")] * 4)
+    agent = ScriptedAgent(env.action_space)  # type: ignore[arg-type]
+    tasks = env.get_attr("task_family")[0].test_tasks[:4]
+    for seed in (1, 2):
+        evaluate_adaptation(agent, env, tasks, n_episodes=1, seed=seed)
+    for seed in (1, 2):
+        PEARL("MlpPolicy", env, seed=seed)
+        starts.append(env.reset())  # type: ignore[arg-type]
+    for first, second in (starts[:2], starts[2:]):
+        assert len(np.unique(np.concatenate([first, second]), axis=0)) == 8
+
+
+def test_rounding_is_no_reward() -> None:
+    """An env may tell what is task-free more precisely than a reward can be."""
+    free = -1000.1
+    nothing, rounded = np.zeros((1, 2)), np.array([free], dtype=np.float32)
+    step = Step(nothing, nothing, rounded, nothing, np.zeros(1), [{"task_free_reward": free}])
+    assert Adaptation._told(step) == 0
+    assert Adaptation._told(step._replace(rewards=np.array([free]))) == 0
 
 
 @pytest.mark.parametrize("explorer", ["prior", "aggregate", "belief", "learned-prior"])

@@ -9,6 +9,7 @@ import torch as th
 from helpers import ENV_ID
 from htr_envs.point_robot import PointRobotDynamics
 from sb3_htr import PEARL
+from sb3_htr.common.type_aliases import Context
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.experiments.calibration import N_BINS, calibration, expected_calibration_error
 from sb3_htr.rivals.scripted import ScriptedAgent
@@ -56,6 +57,22 @@ def test_a_success_may_be_worth_0_and_all_else_less(model: PEARL, monkeypatch: p
 
     monkeypatch.setattr(PointRobotDynamics, "step", paid)
     assert pairs_and_successes() == expected
+
+
+def test_the_context_of_a_task_is_that_of_its_adaptation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The step that solved it is in it, though others of the episode are left out."""
+    model = PEARL("MlpPolicy", ENV_ID, policy_kwargs={"net_arch": [8]}, context_size=2, seed=0)
+    infer, seen = model.policy.infer, list[Context]()
+
+    def watched(context: Context) -> Any:
+        seen.append(context)
+        return infer(context)
+
+    monkeypatch.setattr(model.policy, "infer", watched)
+    bins = calibration(model, ENV_ID, {"goal_distance": 0.15, "n_validation_tasks": 6}, 3)
+    # After those of the adaptation, one of each task that was solved
+    n_solved = round(bins[:, 0].sum() / (6 * 3 * 20))
+    assert n_solved and all(context.rewards.max() > 0 for context in seen[-n_solved:])
 
 
 def test_a_model_that_solves_nothing_has_no_diagram(model: PEARL) -> None:

@@ -14,7 +14,7 @@ import yaml
 from helpers import ENV_ID
 from helpers.results import made_up
 from sb3_htr import PEARL, evaluate_adaptation, make_task_vec_env
-from sb3_htr.adaptation.explorers import Prior
+from sb3_htr.adaptation.explorers import EXPLORERS, Prior
 from sb3_htr.common.checkpoint import write_checkpoint
 from sb3_htr.common.resume import checkpoints
 from sb3_htr.experiments import grid
@@ -214,12 +214,12 @@ def test_plain_settings_of_a_variant_reach_its_evaluation(tmp_path: Path) -> Non
     """Its models are loaded as those of strangers are."""
     kwargs = {"n_test_tasks": 4}
     networks = {"net_arch": [8], "encoder_arch": [8], "n_critics": 3, "optimizer_kwargs": {"eps": 1e-5}}
-    trial: dict[str, Any] = {"n_envs": 4, "n_episodes_per_trial": 2, "n_epochs": 1, "use_sde": True}
+    trial: dict[str, Any] = {"n_envs": 4, "n_episodes_per_trial": 2, "n_epochs": 1}
     trial["policy_kwargs"] = {"lstm_hidden_size": 4, "net_arch": [4], "log_std_init": -0.5}
-    of_sac = {"n_envs": 4, "gradient_steps": 1, "use_sde": True, "policy_kwargs": {"net_arch": [4]}}
+    of_sac = {"n_envs": 4, "gradient_steps": 1, "policy_kwargs": {"net_arch": [4]}}
     variants = (
         Variant("htr-ser", "critics", {**SMALL, "policy_kwargs": networks}, kwargs),
-        Variant("rl2", "sde", trial, kwargs),
+        Variant("rl2", "trials", trial, kwargs),
         Variant("sac-her", "told", of_sac, kwargs),
     )
     for cell in Experiment("settings", "", ENV_ID, 960, variants, 1, 960, by(("prior",))).cells():
@@ -228,6 +228,16 @@ def test_plain_settings_of_a_variant_reach_its_evaluation(tmp_path: Path) -> Non
         both = [replace(agent, trusted=trust).load() for trust in (False, True)]
         ours, theirs = (evaluate_adaptation(model, ENV_ID, n_episodes=1) for model in both)
         np.testing.assert_array_equal(ours, theirs)
+
+
+def test_explorers_that_could_not_be_evaluated_are_not_trained_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_htr.experiments.runner.train.main", None)
+    monkeypatch.setitem(EXPLORERS, "mine", type("Mine", (Prior,), {"__module__": "mine"}))
+    (cell,) = Experiment("one", "", ENV_ID, 480, (Variant("htr-ser", "", {"train_explorer": "mine"}),), 1).cells()
+    with pytest.raises(
+        ValueError, match=r"could not be evaluated: its train_explorer is a class of its own, .* the file\. Leave"
+    ):
+        run_cell(cell, tmp_path)
 
 
 def test_the_code_that_evaluated_is_that_of_the_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

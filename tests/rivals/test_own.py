@@ -14,6 +14,8 @@ import pytest
 import torch as th
 from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from helpers import ENV_ID
 from helpers.results import made_up
@@ -100,8 +102,8 @@ class OwnTD3(OffPolicyRival, TD3):
         return importlib.import_module(MODULE).Unadapted(self.policy, n_envs)
 
 
-def own_td3(**kwargs: Any) -> OwnTD3:
-    env = make_task_vec_env(ENV_ID, 4, seed=0)
+def own_td3(env: VecEnv | None = None, **kwargs: Any) -> OwnTD3:
+    env = env or make_task_vec_env(ENV_ID, 4, seed=0)
     settings = {"policy_kwargs": {"net_arch": [4]}, "learning_starts": 100, "batch_size": 8, "gradient_steps": 2}
     return OwnTD3("MlpPolicy", env, seed=0, **{**settings, **kwargs})
 
@@ -132,6 +134,85 @@ def test_a_training_without_an_update_says_so() -> None:
         UserWarning, match="Nothing was learnt: learning begins after 1000 env steps, at the end of a rollout, and this"
     ):
         own_td3(learning_starts=1000).learn(160)
+
+
+class EndsEarly(gym.Wrapper):
+    """After 13 of 20 steps."""
+
+    def reset(self, **kwargs: Any) -> Any:
+        self.n_steps = 0
+        return super().reset(**kwargs)
+
+    def step(self, action: Any) -> Any:
+        obs, reward, _, truncated, info = super().step(action)
+        self.n_steps += 1
+        return obs, reward, self.n_steps == 13, truncated, info
+
+
+def ends_early() -> VecEnv:
+    return make_task_vec_env(ENV_ID, 2, seed=0, wrapper=EndsEarly)
+
+
+def test_returns_of_several_steps_end_where_a_rollout_does() -> None:
+    """The reset that begins the next one cuts episodes short."""
+    model = OwnSAC("MlpPolicy", ends_early(), seed=0, n_steps=3, learning_starts=0, policy_kwargs={"net_arch": [4]}).learn(80)
+    buffer = model.replay_buffer
+    assert buffer is not None and not buffer.dones[18].any() and buffer.dones[12].all() and not buffer.timeouts[12].any()
+    assert (buffer.next_observations[19] != buffer.observations[20]).any()
+    for start in (18, 19):
+        sample = buffer._get_samples(np.array([start]))
+        assert any(np.array_equal(sample.next_observations[0], last) for last in buffer.next_observations[19])
+        assert sample.dones.item() == 0, "a longer episode would have gone on"
+
+
+def test_noise_with_a_memory_goes_on_exactly() -> None:
+    def make() -> OwnTD3:
+        noise = OrnsteinUhlenbeckActionNoise(np.zeros(2), np.ones(2))
+        return own_td3(env=ends_early(), action_noise=noise, learning_starts=0)
+
+    unbroken = make().learn(160)
+    state = copy.deepcopy(make().learn(80).state_dict())
+    second = make()
+    second.load_state_dict(state)
+    second.learn(80, reset_num_timesteps=False)
+    assert all(th.equal(value, second.policy.state_dict()[name]) for name, value in unbroken.policy.state_dict().items())
+
+
+def test_training_is_on_training_tasks_after_an_evaluation_in_the_same_env(registered: Any) -> None:
+    for make in (own_td3, lambda: registered.PlainPPO("MlpPolicy", make_task_vec_env(ENV_ID, 4, seed=0), **SMALL)):
+        model, seen = make(), set[int]()
+        env = model.get_env()
+        assert env is not None
+        evaluate_adaptation(model, env, n_episodes=1)
+
+        def look(local: dict[str, Any], _: Any, seen: set[int] = seen) -> bool:
+            seen.update(info["task_id"] for info in local["infos"])
+            return True
+
+        model.learn(160, look)
+        assert len(seen) > 1 and -1 not in seen
+
+
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        (lambda: gym.make("Pendulum-v1"), "has no task_family"),
+        (lambda: VecNormalize(make_task_vec_env(ENV_ID, 2)), "VecNormalize stands between the env"),
+    ],
+)
+def test_envs_that_cannot_be_meta_trained_on_are_refused(env: Any, message: str, registered: Any) -> None:
+    for rival in (registered.PlainPPO, OwnTD3):
+        with pytest.raises(ValueError, match=message):
+            rival("MlpPolicy", env())
+        model = rival("MlpPolicy", make_task_vec_env(ENV_ID, 2))
+        with pytest.raises(ValueError, match=message):
+            model.set_env(env())
+
+
+def test_what_would_not_go_on_exactly_is_refused(registered: Any) -> None:
+    for rival in (registered.PlainPPO, OwnSAC, RL2):
+        with pytest.raises(ValueError, match="has no setting 'use_sde': its noise is drawn before a rollout, and"):
+            rival(rival.DEFAULT_POLICY, ENV_ID, use_sde=True)
 
 
 class OwnSAC(OffPolicyRival, SAC):

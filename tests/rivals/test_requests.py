@@ -42,11 +42,21 @@ def test_what_follows_is_no_setting(name: str, tmp_path: Path) -> None:
         SACHER.load(tmp_path / "model", **given)
 
 
-def test_two_models_do_not_share_trials_of_two_lengths() -> None:
-    first = RL2("MlpLstmPolicy", make_task_vec_env(ENV_ID, 2, 0), n_episodes_per_trial=2)
-    with pytest.raises(ValueError, match="trials of 2 episodes, as another model asked for, and n_episodes_per_trial is 5"):
-        RL2("MlpLstmPolicy", first.get_env())
-    assert first.env is not None and first.env.n_episodes == 2
+def test_models_that_share_an_env_have_trials_of_their_own(tmp_path: Path) -> None:
+    first = RL2("MlpLstmPolicy", make_task_vec_env(ENV_ID, 2, 0), n_episodes_per_trial=2, n_trials_per_rollout=1)
+    first.save(tmp_path / "model")
+    again = RL2.load(tmp_path / "model", env=first.get_env())
+    other = RL2("MlpLstmPolicy", first.get_env(), n_trials_per_rollout=1)
+    for model, n in ((first, 2), (again, 2), (other, 5)):
+        assert model.env is not None and model.env.n_episodes == n and model.n_steps == 20 * n
+    with pytest.raises(ValueError, match="give an env of the same time limit"):
+        again.set_env(make_task_vec_env(ENV_ID, 2, env_kwargs={"max_episode_steps": 10}))
+    env = other.get_env()
+    assert env is not None
+    first.set_env(env)
+    assert first.env is not None and first.env.n_episodes == 2 and other.env is not None and other.env.n_episodes == 5
+    first.learn(80)
+    other.learn(200)
 
 
 def test_settings_of_her() -> None:

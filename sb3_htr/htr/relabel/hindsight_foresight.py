@@ -19,8 +19,8 @@ class HindsightForesight(TrainingTaskRelabelling):
     first states of episodes (foresight). Wan, Peng and Gangwani, 2022, https://arxiv.org/abs/2109.09031.
 
     :param temperature: see :class:`TrainingTaskRelabelling`
-    :param context_size: steps of an episode that z is inferred from, evenly spread, at most. Training has no more of them in a
-        context, and each narrows the posterior; HFR's code takes all of them
+    :param context_size: steps of an episode that z is inferred from, evenly spread, at most. As many as
+        the shortest contexts of training have, as each narrows the posterior; HFR's code takes all of them
     :param n_starts: first states that the value is a mean over. In HFR's code 64 to 1024; here all tasks begin alike
     :raises ValueError: for a number that is out of its range
     """
