@@ -1,5 +1,6 @@
 """Meta-test: how well does an agent adapt to tasks that it has never seen?"""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -151,6 +152,7 @@ def record_adaptation(
     explorer: Any = None,
     deterministic: bool = True,
     seed: int = 0,
+    on_end: Callable[[Adapting, np.ndarray], None] | None = None,
 ) -> AdaptationRecord:
     """
     As :func:`evaluate_adaptation`, with what each step achieved.
@@ -162,6 +164,8 @@ def record_adaptation(
     :param explorer: an explorer, its name, or its name and settings
     :param deterministic: mean actions instead of samples
     :param seed: seed of env, z and sampled actions
+    :param on_end: is shown each adaptation as it ends, and the tasks of its envs, (n, task_dim); the last one may have more
+        envs than tasks
     :return: returns, successes and achieved tasks
     """
     if not hasattr(model, "start_adaptation"):
@@ -194,7 +198,10 @@ def record_adaptation(
             obs = reset_to_tasks(env, tasks[index])
             adaptation = model.start_adaptation(env.num_envs, explorer, generator)
             record = run_adaptation(model.policy, env, adaptation, obs, n_episodes, deterministic, (seed, first))
-            records.append([values[: len(tasks) - first] for values in record])
+            own_tasks = tasks[first : first + env.num_envs]
+            records.append([values[: len(own_tasks)] for values in record])
+            if on_end is not None:
+                on_end(adaptation, own_tasks)
     length = max(achieved.shape[2] for _, _, achieved in records)
     for record_ in records:
         padding = ((0, 0), (0, 0), (0, length - record_[2].shape[2]), (0, 0))

@@ -1,5 +1,6 @@
 """What pictures show, and agents whose env cannot be drawn."""
 
+import argparse
 import warnings
 from pathlib import Path
 from typing import Any
@@ -13,10 +14,12 @@ from matplotlib.figure import Figure
 
 from helpers import ENV_ID, TINY, MakePEARL
 from helpers.broken_envs import LineEnv
-from helpers.runs import NOWHERE, make_run
-from sb3_htr import PEARL
+from helpers.runs import NOWHERE, SHIPPED, make_run
+from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.adaptation.evaluation import AdaptationRecord
+from sb3_htr.common.vec_env import N_ENVS
 from sb3_htr.zoo.cli import main
+from sb3_htr.zoo.commands import plot
 from sb3_htr.zoo.commands.plot import check_same_settings
 from sb3_htr.zoo.plots import adaptation, curves, style
 from sb3_htr.zoo.plots.style import curve_colours, curve_styles
@@ -135,6 +138,18 @@ def test_plot_draws_all_pictures_of_an_agent(tmp_path: Path, capsys: pytest.Capt
     assert "No learning curves" in capsys.readouterr().out
     with pytest.raises(ValueError, match="--n-episodes is 0, expected a whole number of at least 1"):
         main(["plot", *NOWHERE, "--n-episodes", "0"])
+
+
+def test_what_is_drawn_is_what_is_evaluated() -> None:
+    agent = TrainedAgent(SHIPPED, {"method": "htr-ser", "env_id": ENV_ID, "env_kwargs": {}}, None)
+    how = {"tasks": "test", "n_episodes": 2, "explorer": "belief", "stochastic": False, "seed": 3, "device": "cpu"}
+    adapted = plot.adapt(agent, argparse.Namespace(**how))
+    returns, successes = evaluate_adaptation(agent.load(), ENV_ID, "test", 2, "belief", seed=3)
+    np.testing.assert_array_equal(adapted.record.returns, returns)
+    assert len(returns) > N_ENVS, "in several adaptations"
+    tasks, mean, deviation, known_z = adapted.latent  # type: ignore[misc]
+    assert len(tasks) == len(mean) == len(deviation) == successes.any(axis=1).sum() > 0 and len(known_z)
+    assert (tasks == adapted.tasks[successes.any(axis=1)]).all()
 
 
 def test_plot_draws_seeds_as_one_curve(

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch as th
 
 from sb3_htr.adaptation.adaptation import Adaptation
-from sb3_htr.adaptation.evaluation import AdaptationRecord, run_adaptation, task_set
+from sb3_htr.adaptation.evaluation import AdaptationRecord, record_adaptation, task_set
+from sb3_htr.adaptation.loop import Adapting
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.checks import get_task_family
-from sb3_htr.common.vec_env import reset_to_tasks
+from sb3_htr.common.vec_env import N_ENVS
 from sb3_htr.zoo.commands.arguments import add_adaptation_arguments, add_agent_arguments, chosen_agent, make_parser
 from sb3_htr.zoo.plots.adaptation import plot_adaptation_curve, plot_adaptation_paths, start_position
 from sb3_htr.zoo.plots.curves import Curve, plot_curves
@@ -75,22 +75,28 @@ def adapt(agent: TrainedAgent, args: argparse.Namespace) -> Adapted:
     """
     print(f"Adapting {agent.path}")
     model = agent.load(args.device)
-    family = get_task_family(agent.make_vec_env(1))
+    env = agent.make_vec_env(N_ENVS)
+    family = get_task_family(env)
     tasks = task_set(family, args.tasks)
-    env = agent.make_vec_env(len(tasks))
-    env.seed(args.seed)
-    obs = reset_to_tasks(env, tasks)
-    adaptation = model.start_adaptation(len(tasks), args.explorer, th.Generator().manual_seed(args.seed))
-    record = run_adaptation(model.policy, env, adaptation, obs, args.n_episodes, not args.stochastic, args.seed)
+    latents: list[Latent] = []
+
+    def look(adaptation: Adapting, own_tasks: np.ndarray) -> None:
+        if isinstance(adaptation, Adaptation):
+            particles = adaptation.knowledge.particles()
+            found = ~adaptation.exploring()
+            if adaptation.knowledge.tells_success:
+                found &= adaptation.best_return > 0
+            found = np.flatnonzero(found[: len(own_tasks)])
+            mean, deviation = adaptation.posterior()
+            known_z = particles.z[particles.is_train].cpu().numpy()
+            latents.append(Latent(own_tasks[found], mean[found], deviation[found], known_z))
+
+    how = args.n_episodes, args.explorer, not args.stochastic, args.seed
+    record = record_adaptation(model, env, tasks, *how, look)
     latent = None
-    if isinstance(adaptation, Adaptation):
-        particles = adaptation.knowledge.particles()
-        found = ~adaptation.exploring()
-        if adaptation.knowledge.tells_success:
-            found &= adaptation.best_return > 0
-        known_z = particles.z[particles.is_train].cpu().numpy()
-        mean, deviation = adaptation.posterior()
-        latent = Latent(tasks[found], mean[found], deviation[found], known_z)
+    if latents:
+        of_tasks, mean, deviation, known_z = zip(*latents, strict=True)
+        latent = Latent(np.concatenate(of_tasks), np.concatenate(mean), np.concatenate(deviation), known_z[0])
     start = start_position(agent.make_env()) if record.achieved.shape[-1] == 2 else None
     explorer = args.explorer or model.explorer.name
     return Adapted(tasks, getattr(family, "goal_radius", None), start, explorer, record, latent)
