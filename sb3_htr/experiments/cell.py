@@ -15,6 +15,14 @@ REMOVE = "Remove it: the same command then evaluates its run again, without trai
 KwArgs = dict[str, Any]
 
 
+def file_name(text: str) -> str:
+    """
+    :param text: name of a run or an evaluation
+    :return: the same, as systems can have it
+    """
+    return re.sub(r"[^\w.=-]+", "_", text.replace(" ", ""))
+
+
 class Evaluation(NamedTuple):
     """
     How a final model adapts to the test tasks.
@@ -74,7 +82,7 @@ class Cell:
     def name(self) -> str:
         """Of its folder."""
         kwargs = "".join(f"-{key}{value}" for key, value in self.env_kwargs.items())
-        return re.sub(r"[^\w.=-]+", "_", f"{self.variant}{kwargs}-seed{self.seed}".replace(" ", ""))
+        return file_name(f"{self.variant}{kwargs}-seed{self.seed}")
 
     @property
     def label(self) -> str:

@@ -1,6 +1,7 @@
 """How every final model is judged: on test tasks that decided nothing, with several seeds, by each explorer alike."""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.experiments.ablations import ABLATIONS
 from sb3_htr.experiments.calibration import calibration
-from sb3_htr.experiments.cell import Cell, KwArgs
+from sb3_htr.experiments.cell import Cell, Evaluation, KwArgs
 from sb3_htr.zoo.run.algorithm import Model
 from sb3_htr.zoo.run.method import OWN
 
@@ -27,28 +28,39 @@ SOLVED_SHARE = 0.8
 Raw = Mapping[str, np.ndarray]
 
 
-def evaluate(cell: Cell, model: Model, trained_with: Any = None) -> KwArgs:
+def _made(name: str, make: Callable[[], KwArgs]) -> KwArgs:
+    return make()
+
+
+def evaluate(
+    cell: Cell, model: Model, trained_with: Any = None, keep: Callable[[str, Callable[[], KwArgs]], KwArgs] = _made
+) -> KwArgs:
     """
     :param cell: says which evaluations
     :param model: at the end of its training
     :param trained_with: explorer as the hyperparameters of its training give it. Its settings hold where it is meant; those
         that are not given are today's defaults, as for all explorers, whatever they were when the model was trained
+    :param keep: of the name of an evaluation and what makes its arrays to these arrays, which may be there already
     :return: ``returns_<evaluation>`` float32 and ``successes_<evaluation>`` bool, (n_eval_seeds, n_tasks, n_episodes); and
         ``calibration``, see :func:`sb3_htr.experiments.calibration.calibration`
     """
     arrays: KwArgs = {}
     for evaluation in cell.evaluations:
-        env_kwargs = {**cell.env_kwargs, **evaluation.tested_on}
-        family = get_task_family(make_task_vec_env(cell.env_id, env_kwargs=env_kwargs))
-        env = make_task_vec_env(cell.env_id, len(family.test_tasks), env_kwargs=env_kwargs)
-        explorer = _explorer(evaluation.explorer, trained_with)
-        records = [
-            evaluate_adaptation(model, env, n_episodes=cell.n_episodes, explorer=explorer, seed=seed) for seed in EVAL_SEEDS
-        ]
-        env.close()
-        returns, successes = map(np.stack, zip(*records, strict=True))
-        arrays |= {f"returns_{evaluation.name}": returns.astype(np.float32), f"successes_{evaluation.name}": successes}
+        arrays |= keep(evaluation.name, partial(_evaluate_by, evaluation, cell, model, trained_with))
     return {**arrays, "calibration": calibration(model, cell.env_id, cell.env_kwargs, cell.n_episodes)}
+
+
+def _evaluate_by(evaluation: Evaluation, cell: Cell, model: Model, trained_with: Any) -> KwArgs:
+    env_kwargs = {**cell.env_kwargs, **evaluation.tested_on}
+    family = get_task_family(make_task_vec_env(cell.env_id, env_kwargs=env_kwargs))
+    env = make_task_vec_env(cell.env_id, len(family.test_tasks), env_kwargs=env_kwargs)
+    explorer = _explorer(evaluation.explorer, trained_with)
+    records = [
+        evaluate_adaptation(model, env, n_episodes=cell.n_episodes, explorer=explorer, seed=seed) for seed in EVAL_SEEDS
+    ]
+    env.close()
+    returns, successes = map(np.stack, zip(*records, strict=True))
+    return {f"returns_{evaluation.name}": returns.astype(np.float32), f"successes_{evaluation.name}": successes}
 
 
 def _explorer(name: str, trained_with: Any) -> Any:

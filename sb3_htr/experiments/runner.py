@@ -2,6 +2,7 @@
 
 import json
 import platform
+import shutil
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,6 +17,7 @@ from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.resume import checkpoints
 from sb3_htr.common.versions import commit, named, processor
 from sb3_htr.experiments.cell import Cell
+from sb3_htr.experiments.kept import FOLDER, Kept, digest_of_code
 from sb3_htr.experiments.log import logged
 from sb3_htr.experiments.protocol import evaluate
 from sb3_htr.pearl.untrusted import EXPLORERS, check_is_ours
@@ -86,6 +88,8 @@ def run_cell(cell: Cell, runs: Path) -> bool:
                     arrays = _train_and_evaluate(cell, folder)
                 with atomic_path(result) as path:
                     np.savez_compressed(path, **arrays)
+                for kept in folder.glob(f"*/*/{FOLDER}"):
+                    shutil.rmtree(kept, ignore_errors=True)
             return True
     except Timeout:
         return False
@@ -93,6 +97,8 @@ def run_cell(cell: Cell, runs: Path) -> bool:
 
 def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
     import_packages(cell.gym_packages)
+    # As it was imported, and may be no more when the training has ended
+    code = digest_of_code(("sb3_htr", "htr_envs", *cell.gym_packages))
     trained = find_finished(cell, folder)
     if trained is None:
         _check_loadable(cell)
@@ -112,6 +118,7 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
     progress = np.genfromtxt(run / "progress.csv", delimiter=",", names=True, deletechars="")
     columns = progress.dtype.names or ()
     record = read_record(run / RECORD)
+    kept = Kept(run, agent_at(run, "last").path, cell.facts(), code)
     return {
         **{key: np.nanmean(progress[f"train/{key}"]) if f"train/{key}" in columns else np.nan for key in LOGGED},
         "timesteps": evaluations["timesteps"],
@@ -124,7 +131,7 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
         "commit": named(record),
         "evaluation_commit": CODE,
         "machine": machine(),
-        **evaluate(cell, model, record["hyperparams"].get("explorer")),
+        **evaluate(cell, model, record["hyperparams"].get("explorer"), kept),
     }
 
 

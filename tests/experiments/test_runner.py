@@ -21,6 +21,7 @@ from sb3_htr.experiments import grid
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.executors import Here
 from sb3_htr.experiments.grid import Experiment, Variant, by
+from sb3_htr.experiments.kept import FOLDER
 from sb3_htr.experiments.protocol import evaluate
 from sb3_htr.experiments.runner import find_finished, run_cell
 from sb3_htr.zoo.cli import main
@@ -104,6 +105,37 @@ def test_a_killed_run_goes_on_and_a_finished_one_is_tested(tmp_path: Path, monke
     with pytest.raises(ValueError, match=r"has batch_size 4, but .* needs 5"):
         find_finished(replace(others, settings={**SMALL, "batch_size": 5}), folder)
     assert find_finished(replace(others, n_timesteps=1200), tmp_path / "nowhere") is None
+
+
+def test_a_killed_evaluation_goes_on_after_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Unless the code is another one by then."""
+    variant = Variant("htr-ser", "tiny", SMALL, {"n_test_tasks": 4})
+    tests = by(("prior", "belief"), {}, {"goal_distance": 0.3})
+    (cell,) = Experiment("one", "", ENV_ID, 480, (variant,), 1, 480, tests).cells()
+    here, elsewhere = tmp_path / "here", tmp_path / "elsewhere"
+    here.mkdir()
+    most, made = 5, list[str]()
+
+    def evaluate_or_die(*args: Any, **kwargs: Any) -> Any:
+        if len(made) == most:
+            raise KeyboardInterrupt
+        made.append(kwargs["explorer"].name)
+        return evaluate_adaptation(*args, **kwargs)
+
+    monkeypatch.setattr("sb3_htr.experiments.protocol.evaluate_adaptation", evaluate_or_die)
+    with pytest.raises(KeyboardInterrupt):
+        run_cell(cell, here)
+    shutil.copytree(here, elsewhere)
+    monkeypatch.setattr(train, "main", refuse)
+    made.clear()
+    assert run_cell(cell, here) and made == ["prior", "prior", "belief", "belief"]
+    most = 99
+    made.clear()
+    monkeypatch.setattr("sb3_htr.experiments.runner.digest_of_code", lambda modules: "other")
+    assert run_cell(cell, elsewhere) and len(made) == 8
+    one, other = (np.load(cell.result(runs)) for runs in (here, elsewhere))
+    assert all((one[key] == other[key]).all() for key in one if key.startswith(("returns", "successes")))
+    assert not list(tmp_path.rglob(FOLDER)), "what is in a result is kept no longer"
 
 
 def test_a_last_checkpoint_that_cannot_be_written_is_no_interrupt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

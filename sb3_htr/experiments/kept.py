@@ -1,0 +1,65 @@
+"""Evaluations of a final model are kept as they end: all of them together may take longer than its training."""
+
+import hashlib
+import json
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import numpy as np
+
+from sb3_htr.common.arrays import load_arrays
+from sb3_htr.common.atomic import atomic_path
+from sb3_htr.experiments.cell import REMOVE, KwArgs, file_name
+
+FOLDER = "evaluated"
+
+
+def digest(files: Iterable[Path]) -> str:
+    """
+    :param files: to read
+    :return: of their contents
+    """
+    whole = hashlib.sha256()
+    for file in files:
+        whole.update(file.read_bytes())
+    return whole.hexdigest()
+
+
+def digest_of_code(modules: Iterable[str]) -> str:
+    """
+    :param modules: names of modules and packages that are imported
+    :return: of their files
+    """
+    files: list[Path] = []
+    for module in modules:
+        file = Path(sys.modules[module].__file__ or "")
+        files += sorted(file.parent.rglob("*.py")) if file.name == "__init__.py" else [file]
+    return digest(files)
+
+
+class Kept:
+    """
+    :param run: folder of the run
+    :param model: file of its final model
+    :param about: what else the evaluations depend on
+    """
+
+    def __init__(self, run: Path, model: Path, *about: str) -> None:
+        self.folder = run / FOLDER
+        self._of = json.dumps([digest([model]), *about])
+
+    def __call__(self, name: str, make: Callable[[], KwArgs]) -> KwArgs:
+        """
+        :param name: of an evaluation
+        :param make: makes it
+        :return: its arrays, from a file where there is one of the same model and of the same of all else
+        """
+        path = self.folder / f"{file_name(name)}.npz"
+        arrays: KwArgs = load_arrays(path, advice=REMOVE) if path.exists() else {}
+        if str(arrays.pop("of", "")) != self._of:
+            arrays = make()
+            self.folder.mkdir(exist_ok=True)
+            with atomic_path(path) as new:
+                np.savez_compressed(new, of=self._of, **arrays)
+        return arrays
