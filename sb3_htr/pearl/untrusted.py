@@ -84,9 +84,10 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
         settings["policy_kwargs"] = _policy_kwargs(data.get("policy_kwargs", {}))
     except (*OPEN_ERRORS, Warning):
         raise
-    except Exception as error:  # whatever a stranger can put into a file
-        why = f": {error}" if isinstance(error, Refused) else "."
-        raise ValueError(f"{path} is damaged, or no model saved by PEARL: nothing of it was loaded{why}") from None
+    except Refused as error:
+        raise ValueError(f"Nothing of {path} was loaded: {error}") from None
+    except Exception:  # whatever a stranger can put into a file
+        raise ValueError(f"{path} is damaged, or no model saved by PEARL: nothing of it was loaded.") from None
     if isinstance(env, str):
         env = make_task_vec_env(env)
     for name in ("policy_kwargs", "replay_buffer_kwargs"):

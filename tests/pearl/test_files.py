@@ -67,7 +67,7 @@ def test_loading_an_untrusted_model_runs_no_code(tiny_pearl: MakePEARL, tmp_path
     tiny_pearl().save(tmp_path / "model.zip")
     for bomb in bombs(fuse):
         repack(tmp_path / "model.zip", tmp_path / "bomb.zip", {"policy.pth": bomb})
-        with pytest.raises(ValueError, match=r"bomb\.zip is damaged, or no model saved by PEARL"):
+        with pytest.raises(ValueError, match=r"bomb\.zip (is damaged, or no model saved by PEARL|was loaded: it)"):
             load_untrusted(tmp_path / "bomb.zip", ENV_ID)
     with zipfile.ZipFile(tmp_path / "model.zip") as archive:
         data = json.loads(archive.read("data"))
@@ -75,7 +75,7 @@ def test_loading_an_untrusted_model_runs_no_code(tiny_pearl: MakePEARL, tmp_path
     hostile: dict[str, Any] = {name: serialized for name in [*data, "learning_rate", "gamma", "replay_buffer_class"]}
     hostile["policy_kwargs"] = {**data["policy_kwargs"], "optimizer_class": serialized}
     repack(tmp_path / "model.zip", tmp_path / "bomb.zip", {"data": json.dumps(hostile).encode()})
-    with pytest.raises(ValueError, match=r"bomb\.zip is damaged, or no model saved by PEARL"):
+    with pytest.raises(ValueError, match=r"bomb\.zip (is damaged, or no model saved by PEARL|was loaded: it)"):
         load_untrusted(tmp_path / "bomb.zip", ENV_ID)
     # What it needs is read, all else is ignored; its weights are fine
     hostile |= {name: data[name] for name in ("policy_class", "explorer", "train_explorer")}

@@ -10,6 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from helpers import ENV_ID, TINY, MakePEARL
@@ -87,7 +88,7 @@ def test_paths_begin_at_the_start_and_name_their_task(drawn: list[Figure]) -> No
 def test_curves_say_what_they_show(drawn: list[Figure], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 200)
     for n_seeds, n_points, said in (
-        (1, 16, "env"),
+        (1, 21, "env"),
         (2, 15, "env; mean and range of 2 seeds"),
         (3, 15, "env; mean of 3 seeds, 95 % interval"),
         (4, 2, "env; IQM over seeds, 95 % interval"),
@@ -98,9 +99,20 @@ def test_curves_say_what_they_show(drawn: list[Figure], monkeypatch: pytest.Monk
         left, right = drawn[-1].axes
         assert [axes.get_ylabel() for axes in (left, right)] == ["return", "share of tasks solved (%)"]
         assert drawn[-1].get_suptitle() == said
-        assert left.lines[0].get_marker() == ("" if n_points > 15 else "o")
+        assert left.lines[0].get_marker() == ("" if n_points > 20 else "o")
         assert left.get_ylim()[1] >= 1 and left.get_ylim()[0] < 0, "zeros are no noise"
         assert right.get_ylim() == (-4, 104)
+
+
+def test_curves_that_coincide_are_all_seen(tmp_path: Path) -> None:
+    names = ["pearl-sparse", "htr-hfr", "htr-hipi"]
+    zeros = np.zeros((1, 12))
+    plots_of = {name: curves.Curve(np.arange(12), zeros, zeros, name) for name in names}
+    curves.plot_curves(plots_of, tmp_path / "x.png", "env", "x", "return")
+    pixels = plt.imread(tmp_path / "x.png")[:420, :, :3]  # above the legend
+    for name, (colour, _) in zip(names, curve_styles(names), strict=True):
+        n_seen = (np.abs(pixels - to_rgb(colour)).max(axis=-1) < 0.02).sum()
+        assert n_seen >= 24, f"{name} is hidden"
 
 
 def test_a_method_has_one_colour_in_all_pictures() -> None:

@@ -8,10 +8,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sb3_htr.zoo.plots.intervals import iqm_interval
-from sb3_htr.zoo.plots.style import curve_styles, save, span_unit_if_flat
+from sb3_htr.zoo.plots.style import COLOURS, curve_styles, save, span_unit_if_flat
 
 # With more points than these, a curve has no markers
-MAX_MARKERS = 15
+MAX_MARKERS = 20
+# Hollow and each of another shape, so that of curves that coincide, as where nothing is solved, all are seen
+MARKERS = dict(zip(COLOURS, "oXD^vxsph*", strict=True))
 
 
 def band(axes: plt.Axes, x: np.ndarray, scores: np.ndarray, colour: str, style: str, label: str) -> None:
@@ -26,7 +28,8 @@ def band(axes: plt.Axes, x: np.ndarray, scores: np.ndarray, colour: str, style: 
     :param label: for the legend
     """
     points = np.array([iqm_interval(scores[..., i]) for i in range(len(x))])
-    axes.plot(x, points[:, 0], style, color=colour, label=label, marker="o" if len(x) <= MAX_MARKERS else "", markersize=4)
+    marker = MARKERS[colour] if len(x) <= MAX_MARKERS else ""
+    axes.plot(x, points[:, 0], style, color=colour, label=label, marker=marker, markersize=5, markerfacecolor="none")
     axes.fill_between(x, points[:, 1], points[:, 2], color=colour, alpha=0.2, linewidth=0)
 
 
