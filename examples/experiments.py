@@ -3,12 +3,13 @@
     sb3-htr experiment two_link_arm --gym-packages examples.experiments
     sb3-htr experiment hidden_target_reacher --gym-packages examples.experiments
     sb3-htr experiment sparse_half_cheetah_velocity --gym-packages examples.experiments
+    sb3-htr experiment ant_goal --gym-packages examples.experiments
     sb3-htr experiment ant_goal_disc --gym-packages examples.experiments
     sb3-htr experiment half_cheetah_velocity --gym-packages examples.experiments
     sb3-htr experiment dense_context --gym-packages examples.experiments
 
-All settings are the defaults, but for the ant's entropy coefficient, which is that of SparseAnt-v0, and for
-half_cheetah_velocity and dense_context, whose rewards are dense: they have PEARL's own protocol.
+All settings are the defaults, those of SparseAnt-v0 on both ants, but for half_cheetah_velocity and dense_context, whose
+rewards are dense: they have PEARL's own protocol.
 """
 
 from examples import (  # noqa: F401 register the envs
@@ -23,12 +24,15 @@ from sb3_htr.experiments.grid import BELIEF, EXPERIMENTS, TUNED_DENSE, Experimen
 
 HTR = (Variant("htr-ser"),)
 RIVALS = (*HTR, Variant("htr-hfr"), Variant("htr-hipi"))
+# Of HFR's ant: a goal is reached from further away
+WIDE = {"goal_radius": 0.8}
 
 for name, env_id, n_timesteps, n_episodes, variants in (
     ("two_link_arm", "TwoLinkArm-v0", 200_000, 20, HTR),
     ("hidden_target_reacher", "HiddenTargetReacher-v0", 150_000, 20, HTR),
-    # The family of HFR, with HFR and what it was compared with; and that of HyperX
+    # The families of HFR, with HFR and what it was compared with; and that of HyperX
     ("sparse_half_cheetah_velocity", "SparseHalfCheetahVelocity-v0", 1_000_000, 20, RIVALS),
+    ("ant_goal", "SparseAnt-v0", 600_000, 20, tuple(Variant(rival.method, env_kwargs=WIDE) for rival in RIVALS)),
     ("ant_goal_disc", "AntGoalDisc-v0", 600_000, 6, (Variant("htr-ser", settings={"ent_coef": 0.05}),)),
 ):
     EXPERIMENTS[name] = Experiment(

@@ -87,7 +87,7 @@ def test_the_experiments_are_of_registered_envs(monkeypatch: pytest.MonkeyPatch)
     known: dict[str, Any] = {}
     monkeypatch.setattr("sb3_htr.experiments.grid.EXPERIMENTS", known)
     runpy.run_module("examples.experiments")
-    assert set(known) == {*FAMILIES, "half_cheetah_velocity", "dense_context"}
+    assert set(known) == {*FAMILIES, "ant_goal", "half_cheetah_velocity", "dense_context"}
     for experiment in known.values():
         cells = experiment.cells()
         assert len(cells) == 5 * len(experiment.variants) and cells[0].env_id in gym.registry
