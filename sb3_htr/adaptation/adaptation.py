@@ -50,6 +50,40 @@ def check_scaled(actions: np.ndarray) -> None:
         )
 
 
+def check_rows(name: str, values: np.ndarray, *expected: int) -> None:
+    """
+    :param name: of the values
+    :param values: of an env each
+    :param expected: shape, beginning with the number of envs
+    :raises ValueError: for another shape, NaN and infinity
+    """
+    if np.shape(values) != expected:
+        raise ValueError(f"The {name} have shape {np.shape(values)}, expected {expected}, a row for each env.")
+    usual = np.abs(values) <= LARGEST  # which nothing is that is NaN
+    if not usual.all():
+        env = int((~usual).reshape(len(values), -1).any(axis=1).argmax())
+        raise ValueError(
+            f"The {name} of env {env} are {values[env]}, expected finite numbers up to {LARGEST:g}: they would be taken "
+            "for evidence. Begin a new Adaptation once the env is mended."
+        )
+
+
+def check_step(step: Step, n_envs: int, obs_dim: int, action_dim: int) -> None:
+    """
+    :param step: of arrays, that an adaptation observes
+    :param n_envs: number of tasks that it adapts to
+    :param obs_dim: width of an observation
+    :param action_dim: width of an action
+    :raises ValueError: for arrays of other shapes, NaN and infinity, and actions that are not scaled
+    """
+    check_rows("observations", step.observations, n_envs, obs_dim)
+    check_rows("rewards", step.rewards, n_envs)
+    check_rows("next_observations", step.next_observations, n_envs, obs_dim)
+    check_rows("actions", step.actions, n_envs, action_dim)
+    check_rows("dones", step.dones, n_envs)
+    check_scaled(step.actions)
+
+
 class Adaptation:
     """
     Keeps the episodes of an adaptation and infers the posterior over z from those that the explorer wants in it.
@@ -120,7 +154,7 @@ class Adaptation:
         """
         obs = np.asarray(obs)
         if not self.is_training:
-            self._check("observations", obs, self.policy.obs_dim)
+            check_rows("observations", obs, self.n_envs, self.policy.obs_dim)
         self.explorer.look(obs)
         return self.policy.act(obs, self.z, deterministic)
 
@@ -144,12 +178,7 @@ class Adaptation:
         obs, actions, rewards, next_obs, dones = map(np.asarray, step[:5])
         step = Step(obs, actions, rewards, next_obs, dones, step.infos)
         if not self.is_training:  # what is collected is checked where it is stored
-            self._check("observations", step.observations, self.policy.obs_dim)
-            self._check("rewards", step.rewards)
-            self._check("next_observations", step.next_observations, self.policy.obs_dim)
-            self._check("actions", step.actions, self.policy.action_dim)
-            self._check("dones", step.dones)
-            check_scaled(step.actions)
+            check_step(step, self.n_envs, self.policy.obs_dim, self.policy.action_dim)
         self.task_reward = self._told(step) if self.is_training else self._learned(step)
         self._remember(step.observations, step.actions, step.rewards, self.task_reward)
         self.episode_return += self.task_reward
@@ -159,18 +188,6 @@ class Adaptation:
         self.explorer.observe(step)
         self.episode_return[ended] = 0
         self._n_steps[ended] = 0
-
-    def _check(self, name: str, values: np.ndarray, *width: int) -> None:
-        shape, expected = np.shape(values), (self.n_envs, *width)
-        if shape != expected:
-            raise ValueError(f"The {name} have shape {shape}, expected {expected}, a row for each env.")
-        usual = np.abs(values) <= LARGEST  # which nothing is that is NaN
-        if not usual.all():
-            env = int((~usual).reshape(self.n_envs, -1).any(axis=1).argmax())
-            raise ValueError(
-                f"The {name} of env {env} are {values[env]}, expected finite numbers up to {LARGEST:g}: they would be taken "
-                "for evidence. Begin a new Adaptation once the env is mended."
-            )
 
     @staticmethod
     def _told(step: Step) -> np.ndarray:

@@ -51,6 +51,18 @@ def check_has_env(env: VecEnv | None) -> None:
         raise ValueError("The model was loaded without an env, which learning needs: pass env to load, or call set_env.")
 
 
+def check_finite(name: str, values: np.ndarray) -> None:
+    """
+    :param name: of the values
+    :param values: of an env each
+    :raises ValueError: for NaN and infinity, of which networks become NaN
+    """
+    finite = np.isfinite(values)
+    if not finite.all():
+        env = int((~finite).reshape(len(values), -1).any(axis=1).argmax())
+        raise ValueError(f"The {name} of env {env} is {values[env]}, expected finite numbers: mend the env.")
+
+
 def warn_without_updates(model: OffPolicyAlgorithm, n_updates: int) -> None:
     """
     :param model: after a training; one that was stopped before its end may go on, and is no reason to warn

@@ -13,11 +13,18 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_htr.adaptation.adaptation import Step, check_scaled
+from sb3_htr.adaptation.adaptation import Step, check_step
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
 from sb3_htr.adaptation.loop import Adapting
 from sb3_htr.common.callback import followed_by, parts_of
-from sb3_htr.common.checks import check_device, check_has_env, check_is_env, check_is_not_normalized, get_task_family
+from sb3_htr.common.checks import (
+    check_device,
+    check_finite,
+    check_has_env,
+    check_is_env,
+    check_is_not_normalized,
+    get_task_family,
+)
 from sb3_htr.common.random_state import checked_seed
 from sb3_htr.common.saving import CheckedFiles
 from sb3_htr.common.settings import check_keywords, check_numbers
@@ -25,6 +32,25 @@ from sb3_htr.common.training_state import Resumable
 from sb3_htr.common.vec_env import N_ENVS, in_float32, make_task_vec_env, seed_envs, set_tasks
 
 SelfRival = TypeVar("SelfRival", bound="Rival")
+# Settings of SB3's algorithms which these do not check: smallest and largest value
+RANGES: dict[str, tuple[float] | tuple[float, float]] = {
+    "learning_rate": (0.0,),
+    "gamma": (0.0, 1.0),
+    "tau": (0.0, 1.0),
+    "gae_lambda": (0.0, 1.0),
+    "clip_range": (0.0,),
+    "clip_range_vf": (0.0,),
+    "ent_coef": (0.0,),
+    "vf_coef": (0.0,),
+    "max_grad_norm": (0.0,),
+    "batch_size": (1,),
+    "buffer_size": (1,),
+    "learning_starts": (0,),
+    "n_epochs": (1,),
+    "n_steps": (1,),
+    "policy_delay": (1,),
+    "target_update_interval": (1,),
+}
 
 
 class OwnWay:
@@ -65,9 +91,12 @@ class RivalAdaptation(ABC):
     def observe(self, step: Step) -> None:
         """
         :param step: what each env did
-        :raises ValueError: for actions that are not scaled
+        :raises ValueError: for arrays of other shapes, NaN and infinity, and actions that are not scaled
         """
-        check_scaled(step.actions)
+        # An adaptation of one's own need not know how wide its env's rows are
+        check_step(
+            step, self.n_envs, *(np.shape(rows)[-1] if np.ndim(rows) else 1 for rows in (step.observations, step.actions))
+        )
         if step.infos:
             self._found |= [bool(info.get("is_success", False)) for info in step.infos]
 
@@ -104,11 +133,22 @@ class ToldAdaptation(RivalAdaptation):
         self._tasks = tasks
 
     def act(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
+        if not hasattr(self, "_tasks"):
+            raise ValueError("Who acts here is told its tasks: call see_tasks, with a row for each env, first.")
         return self._act(obs, self._tasks, deterministic)
+
+    def exploring(self) -> np.ndarray:
+        """
+        :return: (n_envs,) False: there is nothing to find out
+        """
+        return np.zeros(self.n_envs, dtype=bool)
 
 
 class FreshStart(BaseCallback):
-    """Resets all envs where a rollout begins, after other callbacks had a look: so that nothing of an env need be saved."""
+    """
+    Resets all envs where a rollout begins, after other callbacks had a look: so that nothing of an env need be saved. And
+    checks what a step brought, which the libraries do not.
+    """
 
     model: "Rival"
 
@@ -116,6 +156,10 @@ class FreshStart(BaseCallback):
         self.model.begin_rollout()
 
     def _on_step(self) -> bool:
+        check_finite("reward", self.locals["rewards"])
+        observations = self.locals["new_obs"]
+        for values in observations.values() if isinstance(observations, dict) else (observations,):
+            check_finite("observation", values)
         return True
 
 
@@ -169,6 +213,15 @@ class Rival(CheckedFiles, Resumable):
         """
         check_device(settings.get("device", "auto"))
         self.check_names(settings)
+        for name, value in settings.items():
+            # Schedules, and an entropy coefficient that is learnt, are the library's to read
+            if (
+                name in RANGES
+                and value is not None
+                and not callable(value)
+                and not (name == "ent_coef" and isinstance(value, str))
+            ):
+                check_numbers(**{name: (value, *RANGES[name])})
         policy_class = self.policy_aliases.get(policy) if isinstance(policy, str) else policy
         if policy_class is not None:
             check_keywords("policy_kwargs", settings.get("policy_kwargs") or {}, policy_class)
@@ -200,9 +253,10 @@ class Rival(CheckedFiles, Resumable):
         :param explorer: None or ``"own"``: it explores in its own way
         :param generator: source of randomness; torch's global one by default
         :return: acts, and takes in what happens
-        :raises ValueError: for an explorer
+        :raises ValueError: for an explorer, or no task
         """
         check_explores_in_own_way(self, explorer)
+        check_numbers(n_envs=(n_envs, 1))
         return self._adaptation(n_envs, generator)
 
     def check_env(self, env: VecEnv) -> None:

@@ -13,6 +13,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, GymEnv
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her import HerReplayBuffer
+from stable_baselines3.her.goal_selection_strategy import KEY_TO_GOAL_STRATEGY
 from stable_baselines3.sac import SAC
 from stable_baselines3.sac.policies import MultiInputPolicy, SACPolicy
 
@@ -139,7 +140,12 @@ class SACHER(OffPolicyRival, SAC):
         **kwargs: Any,
     ) -> None:
         check_numbers(gradient_steps=(gradient_steps, -1))
-        check_keywords("replay_buffer_kwargs", replay_buffer_kwargs or {}, HerReplayBuffer, without=GIVEN_BY_MODEL)
+        replay = replay_buffer_kwargs or {}
+        check_keywords("replay_buffer_kwargs", replay, HerReplayBuffer, without=GIVEN_BY_MODEL)
+        check_numbers(n_sampled_goal=(replay.get("n_sampled_goal", 4), 0))
+        strategy = replay.get("goal_selection_strategy", "future")
+        if isinstance(strategy, str) and strategy.lower() not in KEY_TO_GOAL_STRATEGY:
+            raise ValueError(f"goal_selection_strategy is {strategy!r}, expected one of {sorted(KEY_TO_GOAL_STRATEGY)}.")
         super().__init__(
             policy,
             env,

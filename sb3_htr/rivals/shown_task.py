@@ -7,7 +7,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_htr.common.checks import check_has_hooks, check_spaces, get_task_family
+from sb3_htr.common.checks import check_finite, check_has_hooks, check_spaces, get_task_family
 from sb3_htr.common.type_aliases import TaskFamily, Trajectory
 from sb3_htr.common.vec_env import CopiedWrapper
 
@@ -79,6 +79,8 @@ class ShownTaskVecEnv(CopiedWrapper):
     def step_wait(self) -> VecEnvStepReturn:
         obs, rewards, dones, infos = self.venv.step_wait()
         assert isinstance(obs, np.ndarray)
+        check_finite("reward", rewards)
+        check_finite("observation", obs)
         before, ended = self._now, np.flatnonzero(dones)
         self._check(obs, dones, infos)
         if len(ended):

@@ -2,13 +2,17 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import numpy as np
 import pytest
 from stable_baselines3.common.callbacks import CallbackList, EvalCallback
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from helpers import ENV_ID
 from sb3_htr import evaluate_adaptation
+from sb3_htr.adaptation.adaptation import Step
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.rivals.rl2 import RL2
@@ -25,6 +29,11 @@ RIVALS = pytest.mark.parametrize(("kind", "policy"), [(RL2, "MlpLstmPolicy"), (S
         ({"policy_kwargs": {"net_arc": [8]}}, "policy_kwargs has no setting 'net_arc': did you mean net_arch"),
         ({"seed": -1}, "seed is -1, expected a whole number"),
         ({"device": "gpu"}, "The device 'gpu' cannot be used: give cpu, cuda"),
+        ({"gamma": 1.5}, "gamma is 1.5, expected a number from 0 to 1"),
+        ({"gamma": "x"}, "gamma is 'x', expected a number"),
+        ({"learning_rate": -1e-3}, "learning_rate is -0.001, expected a number of at least 0"),
+        ({"ent_coef": -1.0}, "ent_coef is -1.0, expected a number of at least 0"),
+        ({"batch_size": 0}, "batch_size is 0, expected a whole number of at least 1"),
     ],
 )
 def test_settings(kind: Any, policy: str, settings: dict[str, Any], message: str) -> None:
@@ -59,7 +68,70 @@ def test_models_that_share_an_env_have_trials_of_their_own(tmp_path: Path) -> No
     other.learn(200)
 
 
+@RIVALS
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"dones": 0}, r"dones have shape \(\), expected \(1,\), a row for each env"),
+        ({"rewards": np.zeros((1, 1))}, r"rewards have shape \(1, 1\), expected \(1,\)"),
+        ({"observations": np.zeros(2)}, r"observations have shape \(2,\), expected \(1, 2\)"),
+        ({"next_observations": np.full((1, 2), np.nan)}, "next_observations of env 0 are .*expected finite numbers"),
+    ],
+)
+def test_steps_that_are_not_whole_are_no_experience(kind: Any, policy: str, changed: dict[str, Any], message: str) -> None:
+    model = kind(policy, make_task_vec_env(ENV_ID, 2, 0))
+    step = Step(np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(1), np.zeros((1, 2)), np.zeros(1, dtype=bool))
+    model.start_adaptation(1).observe(step)
+    with pytest.raises(ValueError, match=message):
+        model.start_adaptation(1).observe(step._replace(**changed))
+
+
+@RIVALS
+def test_an_adaptation_has_a_task(kind: Any, policy: str) -> None:
+    model = kind(policy, make_task_vec_env(ENV_ID, 2, 0))
+    with pytest.raises(ValueError, match="n_envs is 0, expected a whole number of at least 1"):
+        model.start_adaptation(0)
+
+
+def test_who_is_told_the_tasks_must_be() -> None:
+    model = SACHER("MultiInputPolicy", make_task_vec_env(ENV_ID, 2, 0))
+    with pytest.raises(ValueError, match="call see_tasks"):
+        model.start_adaptation(1).act(np.zeros((1, 2)))
+    assert not model.start_adaptation(1).exploring().any()
+
+
+class Broken(VecEnvWrapper):
+    """Says NaN from the third step on, of the second env."""
+
+    def __init__(self, venv: VecEnv, what: str) -> None:
+        super().__init__(venv)
+        self.what, self.n_steps = what, 0
+
+    def reset(self) -> VecEnvObs:
+        return self.venv.reset()
+
+    def step_wait(self) -> VecEnvStepReturn:
+        obs, rewards, dones, infos = self.venv.step_wait()
+        self.n_steps += 1
+        if self.n_steps >= 3:
+            (rewards if self.what == "reward" else cast(np.ndarray, obs))[1] = np.nan
+        return obs, rewards, dones, infos
+
+
+@RIVALS
+@pytest.mark.parametrize("what", ["reward", "observation"])
+def test_what_is_not_finite_is_not_learnt_from(kind: Any, policy: str, what: str) -> None:
+    model = kind(policy, Broken(make_task_vec_env(ENV_ID, 2, 0), what))
+    with pytest.raises(ValueError, match=f"The {what} of env 1 is .*nan.*expected finite numbers"):
+        model.learn(400)
+    assert model.num_timesteps <= 6, "at the step itself"
+
+
 def test_settings_of_her() -> None:
+    with pytest.raises(ValueError, match="goal_selection_strategy is 'futur', expected one of"):
+        SACHER("MultiInputPolicy", ENV_ID, replay_buffer_kwargs={"goal_selection_strategy": "futur"})
+    with pytest.raises(ValueError, match="n_sampled_goal is -1, expected a whole number of at least 0"):
+        SACHER("MultiInputPolicy", ENV_ID, replay_buffer_kwargs={"n_sampled_goal": -1})
     with pytest.raises(ValueError, match="replay_buffer_kwargs has no setting 'n_sampled': did you mean n_sampled_goal"):
         SACHER("MultiInputPolicy", ENV_ID, replay_buffer_kwargs={"n_sampled": 1})
 

@@ -287,4 +287,5 @@ def plot_adapted(
         if found < 2:
             print(f"No latent space: {label} found the reward of {found} of {len(first.tasks)} tasks.")
         else:
-            plot_latent_space(*latent, new("latent_space"), f"{env_id}: posteriors of {found} {args.tasks} tasks")
+            which = f"{found} of {len(first.tasks)} {args.tasks} tasks, whose reward was found"
+            plot_latent_space(*latent, new("latent_space"), f"{env_id}: posteriors of {which}")
