@@ -158,7 +158,7 @@ def check(results: dict[Cell, Path]) -> None:
             )
 
 
-def write(command: str, experiment: Experiment, results: dict[Cell, Path], folder: Path) -> None:
+def write(command: str, experiment: Experiment, results: dict[Cell, Path], folder: Path) -> dict[str, Any]:
     """
     Write ``summary.json``, a ``raw-METHOD.npz`` for each method and the pictures of an experiment.
 
@@ -166,6 +166,7 @@ def write(command: str, experiment: Experiment, results: dict[Cell, Path], folde
     :param experiment: draws the picture
     :param results: raw results of its cells
     :param folder: where they go
+    :return: content of ``summary.json``
     :raises ValueError: if a result lacks something, or runs that are in the folder would be lost; nothing is written then
     """
     check(results)
@@ -175,7 +176,9 @@ def write(command: str, experiment: Experiment, results: dict[Cell, Path], folde
     results = dict(sorted(results.items(), key=lambda result: variants.index(result[0].variant)))
     folder.mkdir(parents=True, exist_ok=True)
     raw_results.pack(results, folder)
+    summary = summarize(command, results)
     with atomic_path(folder / "summary.json") as path:
-        path.write_text(json.dumps(summarize(command, results), indent=1) + "\n")
+        path.write_text(json.dumps(summary, indent=1) + "\n")
     experiment.figure(results, folder / f"{experiment.name}.png")
     figures.reliability(results, folder / "reliability.png")
+    return summary

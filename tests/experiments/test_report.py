@@ -17,6 +17,7 @@ from sb3_htr.experiments import figures, protocol, report
 from sb3_htr.experiments.grid import EXPERIMENTS, Experiment, Variant, by
 from sb3_htr.experiments.protocol import METRICS
 from sb3_htr.experiments.runner import LOGGED
+from sb3_htr.experiments.table import table as as_markdown
 from sb3_htr.zoo.run.method import methods
 
 
@@ -99,7 +100,7 @@ def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monk
     n_places = len({str(evaluation.tested_on) for evaluation in experiment.evaluations})
     assert len(summary["explorer_differences"]) == n_tests - len(variants) * n_places
     assert {difference["of"] for difference in summary["differences"]} <= {cells[0].variant}
-    table = tables.table(summary)
+    table = as_markdown(summary)
     at_home = sum(not evaluation.tested_on for cell in variants.values() for evaluation in cell.evaluations)
     assert table.count("| 1.00 [1.00, 1.00] | 3.00 [3.00, 3.00] |") == at_home
     assert "3 runs, **fewer than the 5 that a claim needs**" in table and "5 evaluation seeds" in table
@@ -111,10 +112,10 @@ def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monk
     assert f"`sb3-htr experiment {name}`, commit abc, " in table
     uneven = [{**row, "n_seeds": 5 if row["variant"] == cells[0].variant else 1} for row in summary["rows"]]
     if len({cell.variant for cell in cells}) > 1:
-        few = tables.table({**summary, "rows": uneven})
+        few = as_markdown({**summary, "rows": uneven})
         assert f"5 runs of {cells[0].variant}; 1 run of {cells[1].variant}" in few and few.count("fewer than the 5") == 1
-    assert "fewer than the 5" in tables.table({**summary, "rows": [{**summary["rows"][0], "n_seeds": n} for n in (1, 5)]})
-    assert "commit abc, evaluated by def, " in tables.table({**summary, "evaluation_commit": "def"})
+    assert "fewer than the 5" in as_markdown({**summary, "rows": [{**summary["rows"][0], "n_seeds": n} for n in (1, 5)]})
+    assert "commit abc, evaluated by def, " in as_markdown({**summary, "evaluation_commit": "def"})
     for methods_of in tables.HEADLINES.values():
         headline = tables.headline({name: summary}, methods_of).splitlines()[2:]
         shown = [cell for cell in variants.values() if cell.variant in methods_of.get(name, ())]

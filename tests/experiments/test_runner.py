@@ -378,7 +378,9 @@ def test_results_of_what_is_finished_are_written_without_training(
     made_up([second], second.result(Path("runs")).parent)
     with pytest.raises(ValueError, match="No run of none is finished"):
         main(["experiment", "none", "pair", "--finished"])
-    assert "1 of 2 runs of pair are finished." in capsys.readouterr().out
+    output = capsys.readouterr().out
+    assert "1 of 2 runs of pair are finished." in output
+    assert "| method | explorer | return of episode" in output and "| htr-ser | `prior` | " in output
     summary = json.loads(Path("results", "pair", "summary.json").read_text())
     assert {row["n_seeds"] for row in summary["rows"]} == {1} and summary["command"] == "sb3-htr experiment pair --seeds 2"
     for wrong in (["--cell", "1"], ["--seed", "7"]):
