@@ -9,7 +9,6 @@ from pathlib import Path
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.experiments import driver, executors, grid, raw_results, report
 from sb3_htr.experiments.cell import Cell
-from sb3_htr.experiments.table import table
 from sb3_htr.zoo.commands.arguments import OF_PACKAGES, make_parser
 from sb3_htr.zoo.run.trust import import_packages
 
@@ -61,8 +60,8 @@ def main(argv: Sequence[str]) -> None:
         print(f"{len(done)} of {len(grids[name])} runs of {name} are finished.")
         if not done or (failed and len(done) < len(grids[name])):
             continue
-        summary = report.write(_command(args, grids[name], outputs[name]), grid.EXPERIMENTS[name], done, outputs[name])
-        print(f"\n{table(summary)}\nResults: {outputs[name]}")
+        report.write(_command(args, grids[name], outputs[name]), grid.EXPERIMENTS[name], done, outputs[name])
+        print(f"Results: {outputs[name]}")
     if failed:
         raise failed
     if nothing := [name for name, done in results.items() if not done]:

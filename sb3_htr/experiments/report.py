@@ -16,6 +16,7 @@ from sb3_htr.experiments.cell import Cell, Evaluation
 from sb3_htr.experiments.grid import Experiment
 from sb3_htr.experiments.protocol import EVAL_SEEDS, METRICS, TIMES, env_steps_to_solved, is_solved, scores
 from sb3_htr.experiments.runner import LOGGED
+from sb3_htr.experiments.table import table
 from sb3_htr.zoo.plots.intervals import iqm_difference, iqm_interval
 
 RETURN = "last_episode_return"
@@ -158,15 +159,14 @@ def check(results: dict[Cell, Path]) -> None:
             )
 
 
-def write(command: str, experiment: Experiment, results: dict[Cell, Path], folder: Path) -> dict[str, Any]:
+def write(command: str, experiment: Experiment, results: dict[Cell, Path], folder: Path) -> None:
     """
-    Write ``summary.json``, a ``raw-METHOD.npz`` for each method and the pictures of an experiment.
+    Print the table, and write ``summary.json``, a ``raw-METHOD.npz`` for each method and the pictures of an experiment.
 
     :param command: that repeats it
     :param experiment: draws the picture
     :param results: raw results of its cells
     :param folder: where they go
-    :return: content of ``summary.json``
     :raises ValueError: if a result lacks something, or runs that are in the folder would be lost; nothing is written then
     """
     check(results)
@@ -181,4 +181,4 @@ def write(command: str, experiment: Experiment, results: dict[Cell, Path], folde
         path.write_text(json.dumps(summary, indent=1) + "\n")
     experiment.figure(results, folder / f"{experiment.name}.png")
     figures.reliability(results, folder / "reliability.png")
-    return summary
+    print(f"\n{table(summary)}")
