@@ -4,7 +4,7 @@ import hashlib
 import re
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -51,16 +51,18 @@ def check_has_env(env: VecEnv | None) -> None:
         raise ValueError("The model was loaded without an env, which learning needs: pass env to load, or call set_env.")
 
 
-def check_finite(name: str, values: np.ndarray) -> None:
+def check_finite(name: str, values: np.ndarray, envs: Sequence[int] | None = None) -> None:
     """
     :param name: of the values
     :param values: of an env each
+    :param envs: which ones, all by default
     :raises ValueError: for NaN and infinity, of which networks become NaN
     """
     finite = np.isfinite(values)
     if not finite.all():
-        env = int((~finite).reshape(len(values), -1).any(axis=1).argmax())
-        raise ValueError(f"The {name} of env {env} is {values[env]}, expected finite numbers: mend the env.")
+        row = int((~finite).reshape(len(values), -1).any(axis=1).argmax())
+        env = row if envs is None else envs[row]
+        raise ValueError(f"The {name} of env {env} is {values[row]}, expected finite numbers: mend the env.")
 
 
 def warn_without_updates(model: OffPolicyAlgorithm, n_updates: int) -> None:

@@ -16,7 +16,7 @@ EXAMPLE = """  sb3-htr experiment point_robot --jobs 2
   sb3-htr experiment rivals wheeled ant --ray auto --runs /shared/runs
                                                         all methods on three envs, five seeds each, on a Ray cluster
   sb3-htr experiment ant --quick                        one seed, a tenth of the env steps: does it run?
-  sb3-htr experiment ant --finished                     tables and pictures, of what has been run so far
+  sb3-htr experiment ant --finished                     a table and pictures, of what has been run so far
   sb3-htr experiment mine --gym-packages my_method --with-results results/rivals
                                                         beside runs that were made before, which are not trained again"""
 

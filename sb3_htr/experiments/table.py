@@ -32,7 +32,8 @@ def table(summary: dict[str, Any]) -> str:
     lines: dict[tuple[str, ...], dict[str, dict[str, dict[str, Any]]]] = {}
     settings = sorted({key for row in rows for key in row["env_kwargs"]})
     for row in rows:
-        key = (*(str(row["env_kwargs"][setting]) for setting in settings), row["variant"], f"`{row['explorer']}`")
+        # Where a variant leaves an argument at its default, the cell is empty
+        key = (*(str(row["env_kwargs"].get(setting, "")) for setting in settings), row["variant"], f"`{row['explorer']}`")
         lines.setdefault(key, {}).setdefault(place(row), {})[row["metric"]] = row
     settings = [setting.replace("_", " ") for setting in settings]
     shown = columns(summary)

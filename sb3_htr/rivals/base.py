@@ -1,14 +1,14 @@
 """What the rivals share: they train on the envs of PEARL, are evaluated as PEARL is, and go on from the same checkpoints."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
@@ -93,10 +93,9 @@ class RivalAdaptation(ABC):
         :param step: what each env did
         :raises ValueError: for arrays of other shapes, NaN and infinity, and actions that are not scaled
         """
-        # An adaptation of one's own need not know how wide its env's rows are
-        check_step(
-            step, self.n_envs, *(np.shape(rows)[-1] if np.ndim(rows) else 1 for rows in (step.observations, step.actions))
-        )
+        # How wide they are is the env's, which an adaptation of one's own need not know
+        obs_dim, action_dim = (np.atleast_1d(rows).shape[-1] for rows in (step.observations, step.actions))
+        check_step(step, self.n_envs, obs_dim, action_dim)
         if step.infos:
             self._found |= [bool(info.get("is_success", False)) for info in step.infos]
 
@@ -125,6 +124,7 @@ class ToldAdaptation(RivalAdaptation):
     def __init__(self, n_envs: int, act: Callable[[np.ndarray, np.ndarray, bool], np.ndarray]) -> None:
         super().__init__(n_envs)
         self._act = act
+        self._tasks: np.ndarray | None = None
 
     def see_tasks(self, tasks: np.ndarray) -> None:
         """
@@ -133,7 +133,7 @@ class ToldAdaptation(RivalAdaptation):
         self._tasks = tasks
 
     def act(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
-        if not hasattr(self, "_tasks"):
+        if self._tasks is None:
             raise ValueError("Who acts here is told its tasks: call see_tasks, with a row for each env, first.")
         return self._act(obs, self._tasks, deterministic)
 
@@ -145,10 +145,7 @@ class ToldAdaptation(RivalAdaptation):
 
 
 class FreshStart(BaseCallback):
-    """
-    Resets all envs where a rollout begins, after other callbacks had a look: so that nothing of an env need be saved. And
-    checks what a step brought, which the libraries do not.
-    """
+    """Resets all envs where a rollout begins, after other callbacks had a look: so that nothing of an env need be saved."""
 
     model: "Rival"
 
@@ -156,11 +153,25 @@ class FreshStart(BaseCallback):
         self.model.begin_rollout()
 
     def _on_step(self) -> bool:
-        check_finite("reward", self.locals["rewards"])
-        observations = self.locals["new_obs"]
-        for values in observations.values() if isinstance(observations, dict) else (observations,):
-            check_finite("observation", values)
         return True
+
+
+class FiniteSteps(BaseCallback):
+    """Ends a training where the env returns NaN or infinity, of which the libraries learn until all networks are NaN."""
+
+    def _on_step(self) -> bool:
+        check_finite("reward", self.locals["rewards"])
+        self._check(self.locals["new_obs"])
+        for env in np.flatnonzero(self.locals["dones"]):
+            final = self.locals["infos"][env]["terminal_observation"]
+            one = {key: value[None] for key, value in final.items()} if isinstance(final, dict) else final[None]
+            self._check(one, [int(env)])
+        return True
+
+    @staticmethod
+    def _check(observations: Any, envs: Sequence[int] | None = None) -> None:
+        for values in observations.values() if isinstance(observations, dict) else (observations,):
+            check_finite("observation", values, envs)
 
 
 class Rival(CheckedFiles, Resumable):
@@ -324,7 +335,7 @@ class Rival(CheckedFiles, Resumable):
         return [*super()._excluded_save_params(), "_log_interval"]
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        result = followed_by(callback, FreshStart())
+        result = followed_by(callback, CallbackList([FiniteSteps(), FreshStart()]))
         for part in parts_of(result):
             if not isinstance(part, EvalCallback) or isinstance(part, MetaEvalCallback):
                 continue

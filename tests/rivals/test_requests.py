@@ -101,7 +101,7 @@ def test_who_is_told_the_tasks_must_be() -> None:
 
 
 class Broken(VecEnvWrapper):
-    """Says NaN from the third step on, of the second env."""
+    """Says NaN from the third step on, of the second env; or where an episode ends."""
 
     def __init__(self, venv: VecEnv, what: str) -> None:
         super().__init__(venv)
@@ -113,7 +113,10 @@ class Broken(VecEnvWrapper):
     def step_wait(self) -> VecEnvStepReturn:
         obs, rewards, dones, infos = self.venv.step_wait()
         self.n_steps += 1
-        if self.n_steps >= 3:
+        if self.what == "last observation":
+            for env in np.flatnonzero(dones):
+                infos[env]["terminal_observation"] = np.full(2, np.nan, dtype=np.float32)
+        elif self.n_steps >= 3:
             (rewards if self.what == "reward" else cast(np.ndarray, obs))[1] = np.nan
         return obs, rewards, dones, infos
 
@@ -125,6 +128,14 @@ def test_what_is_not_finite_is_not_learnt_from(kind: Any, policy: str, what: str
     with pytest.raises(ValueError, match=f"The {what} of env 1 is .*nan.*expected finite numbers"):
         model.learn(400)
     assert model.num_timesteps <= 6, "at the step itself"
+
+
+@RIVALS
+def test_nor_is_the_last_observation_of_an_episode(kind: Any, policy: str) -> None:
+    settings: dict[str, Any] = {"n_episodes_per_trial": 1, "n_trials_per_rollout": 2} if kind is RL2 else {}
+    model = kind(policy, Broken(make_task_vec_env(ENV_ID, 2, 0), "last observation"), **settings)
+    with pytest.raises(ValueError, match=r"The observation of env 0 is .*nan.*expected finite numbers"):
+        model.learn(400)
 
 
 def test_settings_of_her() -> None:

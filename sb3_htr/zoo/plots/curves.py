@@ -23,7 +23,7 @@ def band(axes: plt.Axes, x: np.ndarray, scores: np.ndarray, colour: str, style: 
     :param axes: where
     :param x: (n,)
     :param scores: (n_runs, n) or (n_runs, n_eval_seeds, n_tasks, n)
-    :param colour: of line and band
+    :param colour: of line and band, one of :data:`~sb3_htr.zoo.plots.style.COLOURS`
     :param style: of the line, matplotlib's
     :param label: for the legend
     """
