@@ -86,9 +86,11 @@ def _check_interface(env: gym.Env[Any, Any]) -> TaskFamily:
 
 
 def _check_task_array(tasks: Any, family: TaskFamily, name: str) -> None:
-    task_dim = family.task_space.shape
-    shaped = isinstance(tasks, np.ndarray) and tasks.dtype == np.float32 and tasks.ndim == 2 and tasks.shape[1:] == task_dim
-    _require(shaped and len(tasks) > 0, f"{name} must be a float32 array (n, task_dim) of at least one task.")
+    (task_dim,) = family.task_space.shape
+    is_array = isinstance(tasks, np.ndarray)
+    what = f"a {tasks.dtype} array of shape {tasks.shape}" if is_array else f"a {type(tasks).__name__}"
+    shaped = is_array and tasks.dtype == np.float32 and tasks.ndim == 2 and tasks.shape[1] == task_dim and len(tasks) > 0
+    _require(shaped, f"{name} must be a float32 array (n, {task_dim}) of at least one task, and is {what}.")
     _require(all(family.task_space.contains(task) for task in tasks), f"{name} has a task that is not in the task space.")
 
 
@@ -130,7 +132,7 @@ def _check_step(env: gym.Env[Any, Any], family: TaskFamily, observation: Any, re
     if not told:
         return
     _require(np.isfinite(info["task_free_reward"]), "info['task_free_reward'] is not finite.")
-    _check_task_array(info["achieved_task"][None], family, "info['achieved_task'][None]")
+    _check_task_array(info["achieved_task"][None], family, "info['achieved_task'][None], of hindsight_task,")
 
 
 def _play(

@@ -164,13 +164,23 @@ class TaskFamily(TaskDistribution):
         """
 
 
-def _of_one_step(name: str, values: Any) -> Any:
-    if np.shape(values) != (1,):
+def told_by_hook(name: str, values: Any, expected: tuple[int, ...]) -> Any:
+    """Pass on what a reward hook returned for trajectories of one step.
+
+    :param name: of the hook.
+    :param values: what it returned.
+    :param expected: shape that they should have.
+    :return: the values.
+    :raises ValueError: if they have another one, of which rewards or tasks would go wrong later, far from the hook.
+    """
+    if not isinstance(values, np.ndarray | np.generic) or values.shape != expected:
+        what = f"shape {values.shape}" if isinstance(values, np.ndarray | np.generic) else f"a {type(values).__name__}"
+        kind = "one task for each trajectory" if name == "hindsight_task" else "one value for each step"
         raise ValueError(
-            f"{name} of the task family returned shape {np.shape(values)} for a trajectory of one step, expected (1,): one "
-            "value for each step."
+            f"{name} of the task family returned {what} for trajectories of one step, expected an array of shape "
+            f"{expected}: {kind}."
         )
-    return values[0]
+    return values
 
 
 class TaskEnv(MetaEnv):
@@ -220,14 +230,14 @@ class TaskEnv(MetaEnv):
         assert before is not None and after is not None
         # one reward function for step and for relabelling: compute_reward gives step's rewards again, bit for bit
         traj = Trajectory(before[None], action[None], after[None], np.array([task_free_reward], np.float32))
-        reward = float(_of_one_step("compute_reward", self.compute_reward(traj, self.task)))
+        reward = told_by_hook("compute_reward", self.compute_reward(traj, self.task), (1,))
         info = {
             "task_id": self.task_id,
-            "is_success": bool(_of_one_step("is_success", self.task_family.is_success(traj, self.task))),
-            "achieved_task": self.hindsight_task(traj, 0),
+            "is_success": bool(told_by_hook("is_success", self.task_family.is_success(traj, self.task), (1,))[0]),
+            "achieved_task": told_by_hook("hindsight_task", self.hindsight_task(traj, 0), self.task.shape),
             "task_free_reward": float(traj.task_free_reward[0]),
         }
-        return observation, reward, bool(terminated), False, info
+        return observation, float(reward[0]), bool(terminated), False, info
 
     def compute_reward(self, traj: Trajectory, task: ArrayLike, reward_type: str | None = None) -> FloatArray:
         """:meth:`TaskFamily.compute_reward`, by default of the env's own reward type."""

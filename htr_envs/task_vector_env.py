@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from htr_envs.meta_env import HasTaskFamily, checked_action, task_from_options
-from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, check_reward_type
+from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, check_reward_type, told_by_hook
 
 
 class TaskVectorEnv(HasTaskFamily, VectorEnv[FloatArray, FloatArray, NDArray[Any]], ABC):
@@ -169,7 +169,10 @@ class TaskVectorEnv(HasTaskFamily, VectorEnv[FloatArray, FloatArray, NDArray[Any
         final_obs = np.array(states, dtype=np.float32)
         # an axis of T = 1 makes every copy a trajectory of its own, with its own task
         traj = Trajectory(*(values[:, None] for values in (self._observations, actions, final_obs, task_free_reward)))
-        rewards = self.task_family.compute_reward(traj, self._tasks, self.reward_type)[:, 0]
+        rewards = self.task_family.compute_reward(traj, self._tasks, self.reward_type)
+        rewards = told_by_hook("compute_reward", rewards, (self.num_envs, 1))[:, 0]
+        successes = told_by_hook("is_success", self.task_family.is_success(traj, self._tasks), (self.num_envs, 1))[:, 0]
+        achieved = told_by_hook("hindsight_task", self.task_family.hindsight_task(traj, 0), self._tasks.shape)
         self._elapsed_steps += 1
         truncated = np.zeros(self.num_envs, dtype=np.bool_)
         if self.max_episode_steps is not None:
@@ -177,8 +180,8 @@ class TaskVectorEnv(HasTaskFamily, VectorEnv[FloatArray, FloatArray, NDArray[Any
         done = terminated | truncated
         infos = {
             "task_id": self.task_ids,
-            "is_success": self.task_family.is_success(traj, self._tasks)[:, 0],
-            "achieved_task": self.task_family.hindsight_task(traj, 0),
+            "is_success": successes,
+            "achieved_task": achieved,
             "task_free_reward": np.array(task_free_reward, dtype=np.float32),
             "final_obs": final_obs,
             "_final_obs": done,

@@ -626,20 +626,50 @@ def test_an_env_that_does_not_tell_its_successes_is_named(tiny_pearl: MakePEARL)
         tiny_pearl(env).learn(1)
 
 
-class OneForAll(type(get_task_family(make_task_vec_env(ENV_ID)))):  # type: ignore[misc]
-    def compute_reward(self, *args: Any, **kwargs: Any) -> Any:
-        return super().compute_reward(*args, **kwargs).mean()
-
-
-def test_a_reward_hook_of_another_shape_is_named() -> None:
-    env = gym.make(ENV_ID)
-    env.unwrapped.task_family = OneForAll()  # type: ignore[attr-defined]
+@pytest.mark.parametrize(
+    ("hook", "spoil", "one", "several"),
+    [
+        ("compute_reward", np.mean, r"shape \(\) .* shape \(1,\)", r"shape \(\) .* shape \(4, 1\)"),
+        ("is_success", lambda a: a[..., None], r"shape \(1, 1\) .* shape \(1,\)", r"shape \(4, 1, 1\) .* shape \(4, 1\)"),
+        ("hindsight_task", np.ndarray.tolist, r"a list .* shape \(2,\)", r"a list .* shape \(4, 2\)"),
+        # It has the goal in it, and would be found out when tasks are put side by side
+        (
+            "hindsight_task",
+            lambda a: np.append(a, a, axis=-1),
+            r"shape \(4,\) .* shape \(2,\)",
+            r"shape \(4, 4\) .* shape \(4, 2\)",
+        ),
+    ],
+)
+def test_a_reward_hook_of_another_shape_is_named_in_the_first_step(
+    hook: str, spoil: Any, one: str, several: str, tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env, family = gym.make(ENV_ID), get_task_family(make_task_vec_env(ENV_ID))
     env.reset(seed=0)
-    sentence = r"compute_reward of the task family returned shape \(\) for a trajectory of one step, expected \(1,\)"
-    with pytest.raises(ValueError, match=sentence):
+    model = tiny_pearl(make_task_vec_env(ENV_ID, 4))
+    right = getattr(family, hook)
+    monkeypatch.setattr(type(family), hook, lambda self, *args, **kwargs: spoil(right(*args, **kwargs)))
+    with pytest.raises(ValueError, match=f"^{hook} of the task family returned {one}"):
         env.step(env.action_space.sample())
-    with pytest.raises(AssertionError, match=rf"The env fails in a step\. .*{sentence}"):
+    with pytest.raises(AssertionError, match=rf"The env fails in a step\. .*{hook} of the task family returned {one}"):
         check_task_env(env)
+    with pytest.raises(ValueError, match=f"^At env step 0, .* {hook} of the task family returned {several}"):
+        model.learn(ROLLOUT)
+
+
+class WideBeyondTheEnv(PointRobotFamily):
+    """What an env that asks its family for nothing would not notice."""
+
+    def hindsight_task(self, traj: Any, index: Any) -> Any:
+        tasks = super().hindsight_task(traj, index)
+        return np.append(tasks, tasks, axis=-1) if len(tasks) > 4 else tasks
+
+
+def test_a_hindsight_task_of_another_width_is_named_whoever_made_the_env(tiny_pearl: MakePEARL) -> None:
+    family = WideBeyondTheEnv(goal_distance=0.1)
+    env = BatchedTaskVecEnv(DynamicsVectorEnv(family, PointRobotDynamics(4), max_episode_steps=20))
+    with pytest.raises(ValueError, match=r"hindsight_task returned shape \(\d+, 4\) for \d+ steps, expected \(\d+, 2\)"):
+        tiny_pearl(env).learn(ROLLOUT)
 
 
 def test_a_reward_of_the_dynamics_that_is_no_number_is_named() -> None:

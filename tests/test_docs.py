@@ -1,5 +1,6 @@
 """The Python of the manual and of the README runs, and so do the commands."""
 
+import pkgutil
 import re
 import runpy
 import shlex
@@ -51,6 +52,15 @@ def test_links_and_pictures_are_there() -> None:
     for page in (*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("trained_agents/*.md")):
         for target in re.findall(r"\]\(([^)#\s]+)", page.read_text()):
             assert target.startswith("https://") or (page.parent / target).exists(), f"{page}: {target}"
+
+
+def test_names_that_messages_and_docstrings_give_are_there() -> None:
+    for file in (*ROOT.glob("sb3_htr/**/*.py"), *ROOT.glob("htr_envs/**/*.py")):
+        for name in re.findall(r"(?<![\w/.-])(?:sb3_htr|htr_envs)(?:\.[A-Za-z_]\w*)+", file.read_text()):
+            try:
+                pkgutil.resolve_name(name)
+            except (ImportError, AttributeError) as error:
+                pytest.fail(f"{file} says {name}: {error}")
 
 
 @pytest.mark.parametrize("page", env_pages.ENVS)

@@ -99,7 +99,11 @@ def _check_whole_episodes(
 
 def _check_worth(family: TaskFamily, columns: Transitions, last: np.ndarray) -> None:
     traj = columns.trajectory(last[:, None])
-    achieved = family.hindsight_task(traj, 0)
+    achieved, expected = family.hindsight_task(traj, 0), (len(last), family.train_tasks.shape[1])
+    if np.shape(achieved) != expected:
+        raise ValueError(
+            f"hindsight_task returned shape {np.shape(achieved)} for {len(last)} steps, expected {expected}: a task for each."
+        )
     if not family.is_success(traj, achieved).all():
         raise ValueError(
             "hindsight_task names a task that its own step does not solve, by is_success: hindsight would teach what did "

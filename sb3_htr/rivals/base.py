@@ -342,7 +342,7 @@ class Rival(CheckedFiles, Resumable):
             if part.eval_env.observation_space != self.observation_space:
                 raise ValueError(
                     f"{type(self).__name__} does not act on the observations that {type(part).__name__} shows it: pass "
-                    "sb3_htr.MetaEvalCallback in its place."
+                    "sb3_htr.adaptation.callbacks.MetaEvalCallback in its place."
                 )
         return super()._init_callback(result, progress_bar)
 
