@@ -41,7 +41,7 @@ class CheckedFiles(BaseAlgorithm):
         for name in given:
             if name in cls.FOLLOWS:
                 raise ValueError(f"{cls.__name__} has no setting {name!r}: {cls.FOLLOWS[name]}.")
-        check_keywords(cls.__name__, given, cls, also)
+        check_keywords(cls.__name__, given, cls, also, without=cls.FOLLOWS)
 
     @classmethod
     def load(cls: type[SelfCheckedFiles], path: Any, env: Any = None, *args: Any, **kwargs: Any) -> SelfCheckedFiles:

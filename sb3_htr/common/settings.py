@@ -117,6 +117,7 @@ def check_keywords(
     known = (keywords_of(function) | set(also)) - set(without)
     for name in given:
         if name not in known:
-            nearest = difflib.get_close_matches(name, known, n=1)
-            advice = f"did you mean {nearest[0]}?" if nearest else f"expected one of {sorted(known)}."
+            public = sorted(name for name in known if not name.startswith("_"))
+            nearest = difflib.get_close_matches(name, public, n=1)
+            advice = f"did you mean {nearest[0]}?" if nearest else f"expected one of {public}."
             raise ValueError(f"{owner} has no setting {name!r}: {advice}")

@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_htr.adaptation.adaptation import Step, check_step
+from sb3_htr.adaptation.adaptation import Step, check_rows, check_step
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
 from sb3_htr.adaptation.loop import Adapting
 from sb3_htr.common.callback import followed_by, parts_of
@@ -105,6 +105,10 @@ class RivalAdaptation(ABC):
         """
         return ~self._found
 
+    def _check_observations(self, obs: np.ndarray) -> None:
+        # How wide they are, networks and scripts say themselves
+        check_rows("observations", obs, self.n_envs, *np.shape(obs)[1:])
+
     def deviation(self) -> np.ndarray:
         """
         :return: (n_envs,) NaN: there is no z
@@ -135,6 +139,7 @@ class ToldAdaptation(RivalAdaptation):
     def act(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
         if self._tasks is None:
             raise ValueError("Who acts here is told its tasks: call see_tasks, with a row for each env, first.")
+        self._check_observations(obs)
         return self._act(obs, self._tasks, deterministic)
 
     def exploring(self) -> np.ndarray:

@@ -10,7 +10,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_htr.common.checks import get_max_episode_steps, warn_without_updates
+from sb3_htr.common.checks import check_has_env, get_max_episode_steps, warn_without_updates
 from sb3_htr.rivals.base import Rival
 
 SelfOffPolicyRival = TypeVar("SelfOffPolicyRival", bound="OffPolicyRival")
@@ -51,6 +51,12 @@ class OffPolicyRival(Rival, OffPolicyAlgorithm):
         return self.train_freq.frequency * self.n_envs  # type: ignore[union-attr]
 
     def learn(self: SelfOffPolicyRival, total_timesteps: int, *args: Any, **kwargs: Any) -> SelfOffPolicyRival:
+        check_has_env(self.env)
+        if self.buffer_size < self.n_steps_per_rollout:
+            raise ValueError(
+                f"buffer_size is {self.buffer_size}, and a rollout has {self.n_steps_per_rollout} steps, an episode of each env: "
+                "give it as many or more, because episodes would be overwritten before anything is learnt of them."
+            )
         n_updates = self._n_updates
         super().learn(total_timesteps, *args, **kwargs)
         if total_timesteps > 0:

@@ -46,6 +46,7 @@ class TrialAdaptation(RivalAdaptation):
         self._kept_memory, self._kept_last = self._memory.copy(), self._last.columns.copy()
 
     def act(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
+        self._check_observations(obs)
         begins = np.zeros(self.n_envs, dtype=bool)
         actions, memory = self.policy.predict(
             self._last.beside(obs), (self._memory[0], self._memory[1]), begins, deterministic

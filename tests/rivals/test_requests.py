@@ -18,7 +18,16 @@ from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.rivals.rl2 import RL2
 from sb3_htr.rivals.sac_her import SACHER
 
-RIVALS = pytest.mark.parametrize(("kind", "policy"), [(RL2, "MlpLstmPolicy"), (SACHER, "MultiInputPolicy")])
+RIVALS = pytest.mark.parametrize("kind", [RL2, SACHER])
+SMALL: dict[Any, dict[str, Any]] = {
+    RL2: {"n_trials_per_rollout": 1, "policy_kwargs": {"lstm_hidden_size": 4}},
+    SACHER: {"buffer_size": 2000},
+}
+
+
+def small(kind: Any, env: Any = None, **settings: Any) -> Any:
+    """A model of two envs unless given others."""
+    return kind(kind.DEFAULT_POLICY, make_task_vec_env(ENV_ID, 2, 0) if env is None else env, **SMALL[kind] | settings)
 
 
 @RIVALS
@@ -36,9 +45,9 @@ RIVALS = pytest.mark.parametrize(("kind", "policy"), [(RL2, "MlpLstmPolicy"), (S
         ({"batch_size": 0}, "batch_size is 0, expected a whole number of at least 1"),
     ],
 )
-def test_settings(kind: Any, policy: str, settings: dict[str, Any], message: str) -> None:
+def test_settings(kind: Any, settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        kind(policy, ENV_ID, **settings)
+        kind(kind.DEFAULT_POLICY, ENV_ID, **settings)
 
 
 @pytest.mark.parametrize("name", ["train_freq", "optimize_memory_usage", "replay_buffer_class"])
@@ -46,7 +55,7 @@ def test_what_follows_is_no_setting(name: str, tmp_path: Path) -> None:
     given: dict[str, Any] = {name: True}
     with pytest.raises(ValueError, match=f"SACHER has no setting '{name}': .*(episode of each env|HER's)"):
         SACHER("MultiInputPolicy", ENV_ID, **given)
-    SACHER("MultiInputPolicy", ENV_ID).save(tmp_path / "model")
+    small(SACHER).save(tmp_path / "model")
     with pytest.raises(ValueError, match=f"SACHER has no setting '{name}'"):
         SACHER.load(tmp_path / "model", **given)
 
@@ -78,8 +87,8 @@ def test_models_that_share_an_env_have_trials_of_their_own(tmp_path: Path) -> No
         ({"next_observations": np.full((1, 2), np.nan)}, "next_observations of env 0 are .*expected finite numbers"),
     ],
 )
-def test_steps_that_are_not_whole_are_no_experience(kind: Any, policy: str, changed: dict[str, Any], message: str) -> None:
-    model = kind(policy, make_task_vec_env(ENV_ID, 2, 0))
+def test_steps_that_are_not_whole_are_no_experience(kind: Any, changed: dict[str, Any], message: str) -> None:
+    model = small(kind)
     step = Step(np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(1), np.zeros((1, 2)), np.zeros(1, dtype=bool))
     model.start_adaptation(1).observe(step)
     with pytest.raises(ValueError, match=message):
@@ -87,14 +96,44 @@ def test_steps_that_are_not_whole_are_no_experience(kind: Any, policy: str, chan
 
 
 @RIVALS
-def test_an_adaptation_has_a_task(kind: Any, policy: str) -> None:
-    model = kind(policy, make_task_vec_env(ENV_ID, 2, 0))
+def test_an_adaptation_has_a_task(kind: Any) -> None:
+    model = small(kind)
     with pytest.raises(ValueError, match="n_envs is 0, expected a whole number of at least 1"):
         model.start_adaptation(0)
 
 
+@RIVALS
+@pytest.mark.parametrize(
+    ("obs", "message"),
+    [
+        (np.zeros((2, 2)), r"The observations have shape \(2, 2\), expected \(3, 2\), a row for each env"),
+        (np.full((3, 2), np.nan), "The observations of env 0 are .*expected finite numbers"),
+    ],
+)
+def test_no_action_follows_from_nothing(kind: Any, obs: np.ndarray, message: str) -> None:
+    adaptation = small(kind).start_adaptation(3)
+    if kind is SACHER:
+        adaptation.see_tasks(np.zeros((3, 2), dtype=np.float32))
+    with pytest.raises(ValueError, match=message):
+        adaptation.act(obs)
+
+
+@RIVALS
+def test_settings_that_follow_are_not_suggested(kind: Any) -> None:
+    with pytest.raises(ValueError, match="has no setting 'foo': expected one of") as error:
+        kind(kind.DEFAULT_POLICY, ENV_ID, foo=1)
+    assert not any(repr(name) in str(error.value) for name in (*kind.FOLLOWS, "_init_setup_model"))
+
+
+def test_a_replay_shorter_than_a_rollout() -> None:
+    model = small(SACHER, buffer_size=39)
+    with pytest.raises(ValueError, match="buffer_size is 39, and a rollout has 40 steps"):
+        model.learn(400)
+    assert model.num_timesteps == 0
+
+
 def test_who_is_told_the_tasks_must_be() -> None:
-    model = SACHER("MultiInputPolicy", make_task_vec_env(ENV_ID, 2, 0))
+    model = small(SACHER)
     with pytest.raises(ValueError, match="call see_tasks"):
         model.start_adaptation(1).act(np.zeros((1, 2)))
     assert not model.start_adaptation(1).exploring().any()
@@ -123,17 +162,17 @@ class Broken(VecEnvWrapper):
 
 @RIVALS
 @pytest.mark.parametrize("what", ["reward", "observation"])
-def test_what_is_not_finite_is_not_learnt_from(kind: Any, policy: str, what: str) -> None:
-    model = kind(policy, Broken(make_task_vec_env(ENV_ID, 2, 0), what))
+def test_what_is_not_finite_is_not_learnt_from(kind: Any, what: str) -> None:
+    model = small(kind, Broken(make_task_vec_env(ENV_ID, 2, 0), what))
     with pytest.raises(ValueError, match=f"The {what} of env 1 is .*nan.*expected finite numbers"):
         model.learn(400)
     assert model.num_timesteps <= 6, "at the step itself"
 
 
 @RIVALS
-def test_nor_is_the_last_observation_of_an_episode(kind: Any, policy: str) -> None:
+def test_nor_is_the_last_observation_of_an_episode(kind: Any) -> None:
     settings: dict[str, Any] = {"n_episodes_per_trial": 1, "n_trials_per_rollout": 2} if kind is RL2 else {}
-    model = kind(policy, Broken(make_task_vec_env(ENV_ID, 2, 0), "last observation"), **settings)
+    model = small(kind, Broken(make_task_vec_env(ENV_ID, 2, 0), "last observation"), **settings)
     with pytest.raises(ValueError, match=r"The observation of env 0 is .*nan.*expected finite numbers"):
         model.learn(400)
 
@@ -157,16 +196,16 @@ def test_settings_of_her() -> None:
         (lambda model: evaluate_adaptation(model, model.get_env(), n_episodes=1), "shows more than its observations"),
     ],
 )
-def test_calls(kind: Any, policy: str, call: Callable[[Any], Any], message: str) -> None:
-    model = kind(policy, make_task_vec_env(ENV_ID, 2, 0))
+def test_calls(kind: Any, call: Callable[[Any], Any], message: str) -> None:
+    model = small(kind)
     with pytest.raises(ValueError, match=message):
         call(model)
     assert model.num_timesteps == 0
 
 
 @RIVALS
-def test_sb3s_evaluation_is_refused_before_training(kind: Any, policy: str) -> None:
-    model = kind(policy, make_task_vec_env(ENV_ID, 2, 0))
+def test_sb3s_evaluation_is_refused_before_training(kind: Any) -> None:
+    model = small(kind)
     theirs = EvalCallback(make_task_vec_env(ENV_ID, 1, 0), eval_freq=1)
     for callback in (theirs, [theirs], CallbackList([CallbackList([theirs])])):
         with pytest.raises(ValueError, match=r"does not act on the observations that EvalCallback shows it: pass .*MetaEval"):

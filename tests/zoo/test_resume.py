@@ -309,7 +309,7 @@ def test_an_interrupt_stops_with_a_checkpoint_and_says_how_to_go_on(unbroken: Pa
         time.sleep(0.005)
     os.killpg(process.pid, signal.SIGINT)
     output = process.communicate(timeout=60)[0]
-    assert process.returncode == 0, output
+    assert process.returncode == 130, output
     assert f"sb3-htr train --resume {run}" in output
     assert "Press Ctrl-C again" in output
     assert main(["train", "--resume", str(run)]) == 0
@@ -425,7 +425,8 @@ def test_the_command_that_is_printed_to_go_on_is_taken(
 
         monkeypatch.setattr(MetaExperimentManager, "learn", interrupted)
     few = ["train", "--env", ENV_ID, "-f", str(tmp_path), "--save-freq", "1", "--eval-freq", "-1", "--verbose", "0"]
-    assert main([*few, *given, "-params", *SMALL, *NETS, *settings]) == 0
+    with pytest.raises(KeyboardInterrupt):
+        main([*few, *given, "-params", *SMALL, *NETS, *settings])
     (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("To go on: "))
     assert ("--trust" in line) == trust
     assert main(shlex.split(line)[4:]) == 0

@@ -77,6 +77,7 @@ class MetaExperimentManager(ExperimentManager):
         self.resumed = resumed
         self._claimed: Path | None = None
         self._lock: SystemLock | None = None
+        self._interrupted = False
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """
@@ -299,11 +300,13 @@ class MetaExperimentManager(ExperimentManager):
                 model.learn(n_steps, self.callbacks, log_interval, reset_num_timesteps=not done)  # type: ignore[arg-type]
             except KeyboardInterrupt:
                 print(f"Interrupted at {model.num_timesteps} steps.")
+                self._interrupted = True
             except DivergedError as error:
                 last = next(iter(checkpoints(Path(self.save_path))), None)
                 raise DivergedError(f"{error} The last checkpoint: {last or 'none yet'}.") from None
             finally:
                 stopping = self._checkpointing is not None and self._checkpointing.stopping
+                self._interrupted |= stopping and model.num_timesteps < self.n_timesteps
                 if checkpoints(Path(self.save_path)) and (stopping or model.num_timesteps < self.n_timesteps):
                     print(f"To go on: {self._to_go_on()}")
                 assert model.env is not None
@@ -343,6 +346,7 @@ class MetaExperimentManager(ExperimentManager):
         """
         :param model: at the end of its training
         :raises OSError: if it cannot be written
+        :raises KeyboardInterrupt: when it is written, if the training was interrupted: what follows in a script needs a whole one
         """
         try:
             # As rl_zoo3 does, but that of an id with a dot, what is behind it is no suffix
@@ -359,6 +363,8 @@ class MetaExperimentManager(ExperimentManager):
         finally:
             assert self._lock is not None
             self._lock.release()
+        if self._interrupted:
+            raise KeyboardInterrupt
 
     def objective(self, trial: optuna.Trial) -> float:
         """
