@@ -15,7 +15,7 @@ from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.protocol import scores
 from sb3_htr.zoo.plots.curves import band, finish
 from sb3_htr.zoo.plots.intervals import iqm_interval
-from sb3_htr.zoo.plots.style import COLOURS, curve_colours, save
+from sb3_htr.zoo.plots.style import BLUE, GREY, curve_colours, save
 
 Results = dict[Cell, Path]
 
@@ -163,7 +163,7 @@ def goal_distance(results: Results, path: Path) -> None:
                 values = values / np.array(optimum)[:, None, None]
             # (n_seeds, n_eval_seeds, n_tasks, n_distances)
             band(axes, np.array(x), np.stack(np.split(values, len(x)), axis=-1), colour, "-", variant)
-    left.axhline(1, color=COLOURS[6], linestyle=":", linewidth=1)
+    left.axhline(1, color=GREY, linestyle=":", linewidth=1)
     left.set_ylabel("return of the last episode / optimum")
     right.set_ylabel("test tasks solved in the last episode")
     for axes in (left, right):
@@ -187,10 +187,10 @@ def relabelling(results: Results, path: Path) -> None:
     n = min(map(len, returns), default=0)
     if n:
         heights = np.stack([values[:n] for values in returns], axis=-1)
-        band(left, np.array(probabilities), heights, COLOURS[0], "-", "IQM and 95 % interval")
+        band(left, np.array(probabilities), heights, BLUE, "-", "IQM and 95 % interval")
     for k, values in zip(probabilities, returns, strict=True):
         text = "one seed" if k == 0 else None
-        left.plot([k] * len(values), values.mean(axis=(1, 2)), "o", color=COLOURS[6], markersize=3, label=text)
+        left.plot([k] * len(values), values.mean(axis=(1, 2)), "o", color=GREY, markersize=3, label=text)
     left.set_xlabel("K, probability of relabelling")
     left.set_ylabel("return of the last adaptation episode")
     left.set_title("test tasks, final models", fontsize=10)
@@ -221,8 +221,8 @@ def evaluations(results: Results, path: Path) -> None:
         for evaluation in [evaluation for evaluation in cell.evaluations if evaluation.tested_on == tested_on]:
             row = explorers.index(evaluation.explorer)
             estimate, low, high = iqm_interval(scores(raws, "last_episode_return", evaluation.name))
-            axes.plot([low, high], [row, row], color=COLOURS[0], linewidth=3, alpha=0.4)
-            axes.plot(estimate, row, "o", color=COLOURS[0])
+            axes.plot([low, high], [row, row], color=BLUE, linewidth=3, alpha=0.4)
+            axes.plot(estimate, row, "o", color=BLUE)
         axes.set_title(", ".join(f"{key} {value}" for key, value in tested_on.items()) or "as in training", fontsize=10)
         axes.set_xlim(left=-0.5)
         axes.grid(alpha=0.25)
@@ -245,7 +245,7 @@ def reliability(results: Results, path: Path) -> None:
     if not any(bins.any() for bins in groups.values()):
         return
     figure, axes = plt.subplots(figsize=(4.8, 4.4), layout="constrained")
-    axes.plot([0, 1], [0, 1], color=COLOURS[6], linewidth=1)
+    axes.plot([0, 1], [0, 1], color=GREY, linewidth=1)
     for colour, (variant, bins) in zip(curve_colours([*groups]), groups.items(), strict=True):
         if not bins.any():
             continue

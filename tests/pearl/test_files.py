@@ -355,7 +355,7 @@ def test_layers_of_actor_and_critics_may_differ(tiny_pearl: MakePEARL, tmp_path:
 
 def test_an_entropy_coefficient_that_load_is_given_is_the_one_that_is_used(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
     tiny_pearl(ent_coef=0.01).save(tmp_path / "model")
-    SACHER("MultiInputPolicy", ENV_ID, ent_coef=0.01).save(tmp_path / "told")
+    SACHER("MultiInputPolicy", ENV_ID, ent_coef=0.01, buffer_size=1000).save(tmp_path / "told")
     for model in (PEARL.load(tmp_path / "model", ent_coef=0.2), SACHER.load(tmp_path / "told", ent_coef=0.2)):
         assert model.ent_coef == 0.2 and model.ent_coef_tensor.item() == pytest.approx(0.2)
     assert PEARL.load(tmp_path / "model").ent_coef_tensor.item() == pytest.approx(0.01)
