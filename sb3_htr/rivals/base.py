@@ -288,6 +288,26 @@ class Rival(CheckedFiles, Resumable):
             )
         check_for_correct_spaces(self._wrap_env(env), self.observation_space, self.action_space)
 
+    def predict(self, observation: Any, *args: Any, **kwargs: Any) -> Any:
+        """
+        As the library's, for who wraps an env as training does. In an env as it is, an adaptation acts.
+
+        :param observation: what the wrapped env shows
+        :param args: see Stable-Baselines3's
+        :param kwargs: likewise
+        :return: actions, and memory
+        :raises ValueError: for the observation of an env that is not wrapped
+        """
+        space = self.observation_space
+        is_dict = isinstance(space, spaces.Dict)
+        if isinstance(observation, dict) != is_dict or not (is_dict or np.shape(observation)[-1:] == space.shape):
+            raise ValueError(
+                f"{type(self).__name__} acts on {space}, and this observation has "
+                + ("names" if isinstance(observation, dict) else f"shape {np.shape(observation)}")
+                + ". In an env, call evaluate_adaptation(model, env), or act and observe of model.start_adaptation(n_envs)."
+            )
+        return super().predict(observation, *args, **kwargs)
+
     def begin_rollout(self) -> None:
         """Begin new episodes in all envs, on training tasks: an evaluation may have left others."""
         assert self.env is not None

@@ -54,8 +54,8 @@ class OffPolicyRival(Rival, OffPolicyAlgorithm):
         check_has_env(self.env)
         if self.buffer_size < self.n_steps_per_rollout:
             raise ValueError(
-                f"buffer_size is {self.buffer_size}, and a rollout has {self.n_steps_per_rollout} steps, an episode of each env: "
-                "give it as many or more, because episodes would be overwritten before anything is learnt of them."
+                f"buffer_size is {self.buffer_size}, and a rollout has {self.n_steps_per_rollout} steps, an episode of each "
+                "env: give it as many or more, because episodes would be overwritten before anything is learnt of them."
             )
         n_updates = self._n_updates
         super().learn(total_timesteps, *args, **kwargs)

@@ -231,8 +231,16 @@ class ChangedInfo(LineEnv):
         ("task_free_reward", np.float32(0.0), "info['task_free_reward'] is a float32, it must be a float"),
         ("task_free_reward", float("nan"), "info['task_free_reward'] is not finite"),
         ("achieved_task", [0.0], "info['achieved_task'] is a list, it must be a ndarray"),
-        ("achieved_task", np.zeros(1), "info['achieved_task'][None], of hindsight_task, must be a float32 array (n, 1) of at least one task, and is a float64"),
-        ("achieved_task", np.array([9.0], dtype=np.float32), "info['achieved_task'][None], of hindsight_task, has a task that is not in"),
+        (
+            "achieved_task",
+            np.zeros(1),
+            "info['achieved_task'][None], of hindsight_task, must be a float32 array (n, 1) of at least one task, and",
+        ),
+        (
+            "achieved_task",
+            np.array([9.0], dtype=np.float32),
+            "info['achieved_task'][None], of hindsight_task, has a task that is not in",
+        ),
         ("achieved_task", np.zeros(1, dtype=np.float32), "info['achieved_task'] is the same memory at each step"),
         ("is_success", True, "is_success does not give the info['is_success'] that step gave"),
         ("task_id", 99, "The task changed within an episode"),

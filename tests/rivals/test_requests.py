@@ -194,6 +194,7 @@ def test_settings_of_her() -> None:
         (lambda model: model.learn("1e6"), "total_timesteps is '1e6', expected a number"),
         (lambda model: model.learn(40, log_interval=0), "log_interval is 0, expected a whole number"),
         (lambda model: evaluate_adaptation(model, model.get_env(), n_episodes=1), "shows more than its observations"),
+        (lambda model: model.predict(np.zeros((1, 2))), r"acts on .*shape \(1, 2\)\. In an env, call evaluate_adaptation"),
     ],
 )
 def test_calls(kind: Any, call: Callable[[Any], Any], message: str) -> None:

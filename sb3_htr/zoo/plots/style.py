@@ -12,8 +12,8 @@ import matplotlib.pyplot as plt
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.zoo.run.method import PRIOR, methods
 
-# Okabe and Ito's colours, told apart by all kinds of colour vision, and three dark ones; grey is the last to be taken, as bands
-# of it are those of black
+# Okabe and Ito's colours, told apart by all kinds of colour vision, and three dark ones; grey is the last to be taken, as its
+# bands are those of black
 COLOURS = ["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#882255", "#000000", "#332288", "#999999"]
 BLUE, ORANGE, GREEN, GREY = *COLOURS[:3], COLOURS[-1]
 LINES = ("-", "--", ":")

@@ -346,7 +346,7 @@ class MetaExperimentManager(ExperimentManager):
         """
         :param model: at the end of its training
         :raises OSError: if it cannot be written
-        :raises KeyboardInterrupt: when it is written, if the training was interrupted: what follows in a script needs a whole one
+        :raises KeyboardInterrupt: when it is written, if the training was interrupted: a script should not go on
         """
         try:
             # As rl_zoo3 does, but that of an id with a dot, what is behind it is no suffix
