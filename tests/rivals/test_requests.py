@@ -212,7 +212,7 @@ def test_sb3s_evaluation_is_refused_before_training(kind: Any) -> None:
         with pytest.raises(ValueError, match=r"does not act on the observations that EvalCallback shows it: pass .*MetaEval"):
             model.learn(40, callback)
     assert model.num_timesteps == 0
-    model.learn(40, EvalCallback(model._wrap_env(make_task_vec_env(ENV_ID, 1, 0)), eval_freq=20, verbose=0))
+    model.learn(40, EvalCallback(model._wrap_env(make_task_vec_env(ENV_ID, 1, 0)), eval_freq=20, n_eval_episodes=1, verbose=0))
     ours = MetaEvalCallback(ENV_ID, n_eval_episodes=1, eval_freq=20, verbose=0)
     model.learn(40, ours)
     assert ours.evaluations_timesteps
