@@ -45,7 +45,8 @@ def n_seeds(results: Results) -> int:
 
 
 def _title(results: Results) -> str:
-    return f"{next(iter(results)).env_id}: IQM over {n_seeds(results)} seeds, 95 % interval"
+    n = n_seeds(results)
+    return f"{next(iter(results)).env_id}: {'one seed' if n == 1 else f'IQM over {n} seeds'}, 95 % interval"
 
 
 def label(variant: str, runs: list[tuple[Cell, Any]], results: Results) -> str:
