@@ -71,7 +71,8 @@ def test_of_two_unfinished_runs_the_newer_one_goes_on(tmp_path: Path, monkeypatc
 
 def test_a_killed_run_goes_on_and_a_finished_one_is_tested(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     variant = Variant("htr-ser", "tiny", SMALL, {"n_test_tasks": 10})
-    experiment = Experiment("one", "", ENV_ID, 1200, (variant,), 1, 480, by(("belief", "prior"), {}, {"goal_distance": 0.3}))
+    evaluations = by(("belief", "prior"), {}, {"goal_distance": 0.3})
+    experiment = Experiment("one", "", ENV_ID, 1200, (variant,), 1, 480, evaluations, n_episodes=5)
     (cell,) = experiment.cells()
     folder = cell.run_folder(tmp_path)
     train.main([*cell.training(folder), "--save-freq", "1"])
@@ -85,7 +86,7 @@ def test_a_killed_run_goes_on_and_a_finished_one_is_tested(tmp_path: Path, monke
     assert raw["timesteps"].tolist() == [480, 960] and len(list(folder.glob("*/*"))) == 1
     tests = ["belief", "prior", "belief goal_distance=0.3", "prior goal_distance=0.3"]
     assert [key for key in raw if key.startswith("returns_")] == [f"returns_{test}" for test in tests]
-    assert all(raw[f"returns_{test}"].shape == raw[f"successes_{test}"].shape == (2, 10, 20) for test in tests)
+    assert all(raw[f"returns_{test}"].shape == raw[f"successes_{test}"].shape == (2, 10, 5) for test in tests)
     assert raw["successes_prior goal_distance=0.3"].sum() > raw["successes_prior"].sum(), "near goals are found by chance"
     assert (raw["returns_prior goal_distance=0.3"][0] != raw["returns_prior goal_distance=0.3"][1]).any()
     monkeypatch.setattr(train, "main", refuse)
@@ -111,7 +112,7 @@ def test_a_killed_evaluation_goes_on_after_what_it_has(tmp_path: Path, monkeypat
     """Unless the code is another one by then."""
     variant = Variant("htr-ser", "tiny", SMALL, {"n_test_tasks": 4})
     tests = by(("prior", "belief"), {}, {"goal_distance": 0.3})
-    (cell,) = Experiment("one", "", ENV_ID, 480, (variant,), 1, 480, tests).cells()
+    (cell,) = Experiment("one", "", ENV_ID, 480, (variant,), 1, 480, tests, n_episodes=3).cells()
     here, elsewhere = tmp_path / "here", tmp_path / "elsewhere"
     here.mkdir()
     most, made = 5, list[str]()
@@ -162,7 +163,7 @@ def test_the_command_repeats_an_experiment(
         Variant("htr-ec", "coarse", settings, {"goal_distance": 0.5, "n_test_tasks": 4}),
         Variant("pearl-sparse-prior", "", SMALL, {"n_test_tasks": 4}),
     )
-    experiment = Experiment("tiny", "Two tiny runs.", ENV_ID, 9600, variants, eval_freq=4800, evaluations=by(("belief",)))
+    experiment = Experiment("tiny", "Two tiny runs.", ENV_ID, 9600, variants, 1, 4800, by(("belief",)), n_episodes=3)
     monkeypatch.setitem(grid.EXPERIMENTS, "tiny", experiment)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit):
