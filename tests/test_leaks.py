@@ -13,7 +13,7 @@ from sb3_htr.htr import EpisodeClustering
 from sb3_htr.zoo.cli import main
 
 # 100,000 in the nightly run
-N_UPDATES = int(os.environ.get("SB3_HTR_UPDATES", 1_500))
+N_UPDATES = int(os.environ.get("SB3_HTR_UPDATES", 3_000))
 
 
 def resident_bytes() -> int:
