@@ -9,6 +9,7 @@ from torch import nn
 from sb3_htr.adaptation.policy import ContextualPolicy
 from sb3_htr.adaptation.reward_watch import RewardWatch
 from sb3_htr.adaptation.task_bank import MAX_HINDSIGHT_TASKS, MAX_TRAIN_TASKS, TaskBank
+from sb3_htr.common.linear import left_to_torch
 
 # Quantiles of what unrewarded and rewarded steps return beside what the model says is task-free; rewards are told from the
 # model's errors by the middle between the two
@@ -109,7 +110,8 @@ class LatentKnowledge(nn.Module):
         n_known = int(self.is_train[: int(self.n_particles)].sum())
         knows_enough = bank.n_train_solved >= min(n_known, bank.n_train) or bank.n_solved >= int(self.n_particles)
         if bank.n_solved > 0 and knows_enough:
-            with th.no_grad():
+            # Each time, the solved tasks have another number of steps
+            with th.no_grad(), left_to_torch():
                 particles = self._solved(policy, bank, gamma)
             self.set_particles(particles)
             bank.rank(particles.log_prior.cpu().numpy())

@@ -3,7 +3,8 @@ Linear layers, and stacks of them, through oneDNN, whose float32 products on pro
 as MKL's.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import torch as th
@@ -162,7 +163,26 @@ def _n_padding(n: int) -> int:
     return -n % max(MIN_ROWS, 1 << n.bit_length() - 5)
 
 
+_leave_to_torch = False
+
+
+@contextmanager
+def left_to_torch() -> Iterator[None]:
+    """
+    Layers are ``torch.nn``'s for a while, where the number of rows is another one each time. What oneDNN prepares for each,
+    up to half a megabyte for a product, it keeps, and preparing takes as long as it saves.
+    """
+    global _leave_to_torch
+    before, _leave_to_torch = _leave_to_torch, True
+    try:
+        yield
+    finally:
+        _leave_to_torch = before
+
+
 def _suits_onednn(x: th.Tensor) -> bool:
+    if _leave_to_torch:
+        return False
     fits = onednn is not None and x.is_cpu and x.dtype == th.float32 and x.dim() == 2 and len(x) >= MIN_ROWS
     return fits and th.get_float32_matmul_precision() == "highest"
 

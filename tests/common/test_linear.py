@@ -12,7 +12,7 @@ from torch import nn
 from torch.nn.utils import parametrize, prune
 
 from sb3_htr.common import linear
-from sb3_htr.common.linear import MIN_ROWS, Linear, Stack, find_onednn, with_fast_layers
+from sb3_htr.common.linear import MIN_ROWS, Linear, Stack, find_onednn, left_to_torch, with_fast_layers
 from sb3_htr.common.matmul import matmul_precision
 
 LAYERS = {
@@ -76,6 +76,24 @@ def test_onednn_meets_few_shapes_however_many_rows_there_are(monkeypatch: pytest
             assert layer(th.zeros(n, 128)).shape == (n, 128)
     assert 10 < len(shapes) < 50
     assert max(shapes) < 2_100
+
+
+@pytest.mark.usefixtures("everything_through_onednn")
+def test_what_is_left_to_torch_prepares_nothing_in_onednn(monkeypatch: pytest.MonkeyPatch) -> None:
+    shapes, fastest = [], linear.onednn
+    assert fastest is not None
+
+    def product(x: th.Tensor, *others: Any) -> th.Tensor:
+        shapes.append(len(x))
+        return fastest(x, *others)
+
+    monkeypatch.setattr(linear, "onednn", product)
+    stack, x = with_fast_layers(nn.Sequential(nn.Linear(8, 8), nn.ReLU(), nn.Linear(8, 2))), th.ones(MIN_ROWS, 8)
+    with left_to_torch():
+        left = stack(x)
+        assert shapes == []
+    th.testing.assert_close(stack(x), left, rtol=1e-5, atol=1e-5)
+    assert shapes == [MIN_ROWS] * 2
 
 
 @pytest.mark.parametrize("dtype", [th.float64, th.bfloat16])
