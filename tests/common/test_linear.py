@@ -60,40 +60,38 @@ def test_results_and_gradients_are_those_of_torch(n: int, n_in: int, n_out: int,
         th.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-4)
 
 
-def test_onednn_meets_few_shapes_however_many_rows_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It prepares something for each, which takes time and memory."""
-    shapes, fastest = set(), linear.onednn
+@pytest.fixture
+def onednn_rows(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Rows of each product that oneDNN is asked for."""
+    rows, fastest = list[int](), linear.onednn
     assert fastest is not None
 
     def product(x: th.Tensor, *others: Any) -> th.Tensor:
-        shapes.add(len(x))
+        rows.append(len(x))
         return fastest(x, *others)
 
     monkeypatch.setattr(linear, "onednn", product)
+    return rows
+
+
+def test_onednn_meets_few_shapes_however_many_rows_there_are(onednn_rows: list[int]) -> None:
+    """It prepares something for each, which takes time and memory."""
     layer = Linear(128, 128)
     with th.no_grad():
         for n in range(MIN_ROWS, 2_000):
             assert layer(th.zeros(n, 128)).shape == (n, 128)
-    assert 10 < len(shapes) < 50
-    assert max(shapes) < 2_100
+    assert 10 < len(set(onednn_rows)) < 50
+    assert max(onednn_rows) < 2_100
 
 
 @pytest.mark.usefixtures("everything_through_onednn")
-def test_what_is_left_to_torch_prepares_nothing_in_onednn(monkeypatch: pytest.MonkeyPatch) -> None:
-    shapes, fastest = [], linear.onednn
-    assert fastest is not None
-
-    def product(x: th.Tensor, *others: Any) -> th.Tensor:
-        shapes.append(len(x))
-        return fastest(x, *others)
-
-    monkeypatch.setattr(linear, "onednn", product)
+def test_what_is_left_to_torch_prepares_nothing_in_onednn(onednn_rows: list[int]) -> None:
     stack, x = with_fast_layers(nn.Sequential(nn.Linear(8, 8), nn.ReLU(), nn.Linear(8, 2))), th.ones(MIN_ROWS, 8)
     with left_to_torch():
         left = stack(x)
-        assert shapes == []
+        assert onednn_rows == []
     th.testing.assert_close(stack(x), left, rtol=1e-5, atol=1e-5)
-    assert shapes == [MIN_ROWS] * 2
+    assert onednn_rows == [MIN_ROWS] * 2
 
 
 @pytest.mark.parametrize("dtype", [th.float64, th.bfloat16])
