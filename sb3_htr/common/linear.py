@@ -181,10 +181,8 @@ def left_to_torch() -> Iterator[None]:
 
 
 def _suits_onednn(x: th.Tensor) -> bool:
-    if _leave_to_torch:
-        return False
-    fits = onednn is not None and x.is_cpu and x.dtype == th.float32 and x.dim() == 2 and len(x) >= MIN_ROWS
-    return fits and th.get_float32_matmul_precision() == "highest"
+    wanted = onednn is not None and not _leave_to_torch and th.get_float32_matmul_precision() == "highest"
+    return wanted and x.is_cpu and x.dtype == th.float32 and x.dim() == 2 and len(x) >= MIN_ROWS
 
 
 class Linear(nn.Linear):
