@@ -148,7 +148,8 @@ def write_content(name: str, content: dict[str, Any]) -> None:
 
 def machine() -> str:
     """
-    :return: processor, threads and versions
+    :return: processor, threads and versions, and the GPU where one was used
     """
     about = f"{processor()}, {os.cpu_count()} cores, Python {platform.python_version()}, torch {th.__version__}"
-    return f"{about}, {th.get_num_threads()} thread(s)"
+    gpu = f", {th.cuda.get_device_name()}" if th.cuda.is_initialized() else ""
+    return f"{about}, {th.get_num_threads()} thread(s){gpu}"

@@ -27,6 +27,11 @@ try:
     from mujoco.rollout import Rollout
 except ImportError as error:
     raise DependencyNotInstalled('MuJoCo is missing or too old: run `pip install "sb3_htr[mujoco]"`.') from error
+except (AttributeError, RuntimeError) as error:  # of PyOpenGL without the library, and of MuJoCo for an unknown name
+    raise DependencyNotInstalled(
+        f"MuJoCo cannot draw by what MUJOCO_GL asks for, {os.environ.get('MUJOCO_GL')}: install that library, take another of "
+        "egl, osmesa and glfw, or unset MUJOCO_GL, which is needed for pictures alone."
+    ) from error
 
 DoubleArray = NDArray[np.float64]
 

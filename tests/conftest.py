@@ -1,5 +1,6 @@
-"""Fixtures, and how hard hypothesis looks."""
+"""Fixtures, where tests run, and how hard hypothesis looks."""
 
+import os
 from typing import Any
 
 import pytest
@@ -15,6 +16,18 @@ th.set_num_threads(1)
 settings.register_profile("ci", deadline=None, max_examples=50)
 settings.register_profile("nightly", deadline=None, max_examples=2000)
 settings.load_profile("ci")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """What tests expect are tensors and bits of a CPU, also where there is a GPU; what needs one is tested by ``-m gpu``."""
+    if config.option.markexpr != "gpu":
+        os.environ["CUDA_VISIBLE_DEVICES"] = ""
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Whether it can run here."""
+    if item.get_closest_marker("gpu") is not None and not th.cuda.is_available():
+        pytest.skip("needs a GPU, and -m gpu")
 
 
 @pytest.fixture

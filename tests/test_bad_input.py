@@ -776,7 +776,6 @@ def test_a_model_file_that_is_not_there_is_not_damaged(tiny_pearl: MakePEARL, tm
         load_untrusted(tmp_path / "nothing", ENV_ID)
 
 
-@pytest.mark.skipif(th.cuda.is_available(), reason="of a machine without GPU")
 def test_a_gpu_that_is_not_there_is_not_replaced_in_silence(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
     """SB3 takes the CPU and says nothing."""
     with pytest.warns(UserWarning, match="There is no cuda that torch could use: cpu is used"):

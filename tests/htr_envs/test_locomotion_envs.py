@@ -400,3 +400,30 @@ for make in (gymnasium.make, gymnasium.make_vec):
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.splitlines() == ['MuJoCo is missing or too old: run `pip install "sb3_htr[mujoco]"`.'] * 4
+
+
+@pytest.mark.parametrize("how", ["egl", "nonsense"])
+def test_mujoco_that_cannot_draw_as_the_environment_asks_says_so(how: str) -> None:
+    """MuJoCo looks for the library when it is imported, and says nothing of the variable."""
+    code = """
+import ctypes
+load = ctypes.CDLL.__init__
+
+def load_others(library, name, *args, **kwargs):
+    if "libEGL" in str(name):
+        raise OSError("there is no such library")
+    load(library, name, *args, **kwargs)
+
+ctypes.CDLL.__init__ = load_others
+import gymnasium, htr_envs
+try:
+    gymnasium.make("SparseWheeled-v0")
+except gymnasium.error.DependencyNotInstalled as error:
+    print(error)
+"""
+    environment = {**os.environ, "MUJOCO_GL": how}
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    assert result.stdout.splitlines() == [
+        f"MuJoCo cannot draw by what MUJOCO_GL asks for, {how}: install that library, take another of egl, osmesa and glfw, or "
+        "unset MUJOCO_GL, which is needed for pictures alone."
+    ]

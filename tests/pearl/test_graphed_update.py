@@ -1,4 +1,4 @@
-"""Updates on meta-batches of one shape, in the same memory each time, and recorded once."""
+"""Updates on meta-batches of one shape, in the same memory each time, and recorded once; captured, where there is a GPU."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -17,6 +17,7 @@ from helpers import ROLLOUT, MakePEARL, parameters
 from helpers.recording import capture
 from sb3_htr import PEARL
 from sb3_htr.common.packed import Packed, tensors_of
+from sb3_htr.common.resume import CheckpointCallback, load_latest
 from sb3_htr.common.type_aliases import MultiTaskSamples
 from sb3_htr.pearl import graphed_update
 from sb3_htr.pearl.graphed_update import FixedUpdate, GraphedUpdate, capturable
@@ -41,29 +42,37 @@ def uneven(model: PEARL) -> Callable[..., MultiTaskSamples]:
     def cut(*args: Any, **sizes: Any) -> MultiTaskSamples:
         data = sample(*args, **sizes)
         labels, n = data.labels, len(data.rewards)
+        lengths, device = data.lengths.cpu().numpy(), data.rewards.device
         keep = np.sort(rng.choice(n, size=int(rng.integers(n // 2, n)), replace=False))
-        keep = np.union1d(keep, np.cumsum(data.lengths.numpy()) - 1)  # one of each task
-        task = np.repeat(np.arange(len(data.lengths)), data.lengths)
+        keep = np.union1d(keep, np.cumsum(lengths) - 1)  # one of each task
+        task = np.repeat(np.arange(len(lengths)), lengths)
         rows = ("observations", "actions", "next_observations", "rewards", "dones", "discounts")
         data = data._replace(
-            **{name: getattr(data, name)[keep] for name in rows}, lengths=th.from_numpy(np.bincount(task[keep]))
+            **{name: getattr(data, name)[th.from_numpy(keep).to(device)] for name in rows},
+            lengths=th.from_numpy(np.bincount(task[keep])).to(device),
         )
         assert labels is not None
         n_labelled = int(rng.integers(3, len(keep)))
         few = {name: getattr(labels, name)[:n_labelled] for name in ("next_observations", "reward", "task_free")}
-        weights = th.full((n_labelled,), 1 / n_labelled)
-        return data._replace(labels=labels._replace(**few, rows=th.arange(n_labelled), weights=weights))
+        weights = th.full((n_labelled,), 1 / n_labelled, device=device)
+        return data._replace(labels=labels._replace(**few, rows=th.arange(n_labelled, device=device), weights=weights))
 
     return cut
 
 
 @pytest.fixture
-def pair(tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch) -> tuple[PEARL, PEARL]:
+def device() -> str:
+    """Of the pair."""
+    return "cpu"
+
+
+@pytest.fixture
+def pair(tiny_pearl: MakePEARL, device: str, monkeypatch: pytest.MonkeyPatch) -> tuple[PEARL, PEARL]:
     """
     Models alike with the same experience, the second of which fills its meta-batches up. Noise is a number: of what is drawn,
     more rows get other numbers.
     """
-    models = [tiny_pearl(**SETTINGS, cuda_graph=graph) for graph in (False, True)]
+    models = [tiny_pearl(**SETTINGS, cuda_graph=graph, device=device) for graph in (False, True)]
     for model in models:
         with pytest.warns(UserWarning, match="Nothing was learnt"):
             model.learn(2 * ROLLOUT)
@@ -72,11 +81,15 @@ def pair(tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch) -> tuple[PEARL,
     return models[0], models[1]
 
 
+def optimizers_of(model: PEARL) -> list[th.optim.Optimizer]:
+    assert model.ent_coef_optimizer is not None
+    networks = (model.actor, model.critic, model.encoder, model.reward_model)
+    return [*(network.optimizer for network in networks), model.ent_coef_optimizer]
+
+
 def graphed(model: PEARL) -> GraphedUpdate:
     """Its update, recorded."""
-    optimizers = [network.optimizer for network in (model.actor, model.critic, model.encoder, model.reward_model)]
-    assert model.ent_coef_optimizer is not None
-    return GraphedUpdate(model._gradient_step, model.device, [*optimizers, model.ent_coef_optimizer])
+    return GraphedUpdate(model._gradient_step, model.device, optimizers_of(model))
 
 
 @contextmanager
@@ -109,6 +122,44 @@ def test_losses_of_a_hundred_updates_are_the_same(
         th.testing.assert_close(*pair_of_weights, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.gpu
+@pytest.mark.parametrize("device", ["cuda"])
+def test_a_captured_update_learns_what_operations_learn_and_waits_for_nothing(pair: tuple[PEARL, PEARL]) -> None:
+    eager, fixed = pair
+    assert fixed.replay_buffer is not None
+    learn, fixed.replay_buffer.device = graphed(fixed), th.device("cpu")
+    for _ in range(100):
+        mean, log = eager._update(5)
+        is_captured = len(learn._replays) == 2  # to capture, optimizers get their counts of steps from the CPU
+        th.cuda.set_sync_debug_mode("error" if is_captured else "default")
+        try:
+            own_mean, own_log = fixed._update(5, learn)
+        finally:
+            th.cuda.set_sync_debug_mode("default")
+        for name, value in log.items():
+            th.testing.assert_close(own_log[name], value, rtol=1e-4, atol=1e-4, msg=partial("{}: {}".format, name))
+        th.testing.assert_close(own_mean, mean, rtol=1e-4, atol=1e-4)
+    assert len(learn._replays) == 2, "with and without the target critics"
+    for pair_of_weights in zip(eager.critic_target.parameters(), fixed.critic_target.parameters(), strict=True):
+        th.testing.assert_close(*pair_of_weights, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.gpu
+def test_a_captured_update_draws_other_noise_each_time(tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All else stays as it is: rates are zero, and the target critics are the critics."""
+    with pytest.warns(UserWarning, match="Nothing was learnt"):
+        model = tiny_pearl(**SETTINGS, cuda_graph=True, device="cuda").learn(2 * ROLLOUT)
+    assert model.replay_buffer is not None
+    model.replay_buffer.device = th.device("cpu")
+    data = model.replay_buffer.sample(5, meta_batch_size=6, context_size=9, n_labelled=256)
+    monkeypatch.setattr(model.replay_buffer, "sample", lambda *_, **__: data)
+    for optimizer in optimizers_of(model):
+        optimizer.param_groups[0]["lr"] = 0.0
+    learn = graphed(model)
+    losses = {model._update(5, learn)[1]["critic_loss"].item() for _ in range(20)}
+    assert len(losses) == 20 and max(losses) < 2 * min(losses)
+
+
 def test_what_a_recording_repeats_is_what_it_saw() -> None:
     """So the test before finds what is a constant of a recording, and should not be."""
     x, y, count = th.zeros(3), th.zeros(3), [0]
@@ -126,8 +177,9 @@ def test_what_a_recording_repeats_is_what_it_saw() -> None:
     assert y.tolist() == [5.0] * 3 and count == [1]
 
 
-def test_training_with_filled_meta_batches_learns_and_is_saved(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
-    model = tiny_pearl(cuda_graph=True, meta_batch_size=64)  # 256 rows and more have labels
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def test_training_with_filled_meta_batches_learns_and_is_saved(device: str, tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    model = tiny_pearl(cuda_graph=True, meta_batch_size=64, device=device)  # 256 rows and more have labels
     before = parameters(model)
     model.learn(2 * ROLLOUT)
     after = parameters(model)
@@ -137,6 +189,27 @@ def test_training_with_filled_meta_batches_learns_and_is_saved(tiny_pearl: MakeP
     model.save(tmp_path / "model")
     loaded = PEARL.load(tmp_path / "model", env=model.get_env(), device="cpu")
     assert loaded.cuda_graph
+    for name, value in parameters(loaded).items():
+        assert th.equal(value, after[name].cpu()), name
+    loaded.learn(ROLLOUT, reset_num_timesteps=False)
+    assert loaded._n_updates == 9
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("cuda_graph", [False, True])
+def test_a_training_on_a_gpu_goes_on(cuda_graph: bool, tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    ends = []
+    for parts in ((4,), (2, 2)):
+        for i, n_rollouts in enumerate(parts):
+            model = tiny_pearl(cuda_graph=cuda_graph, device="cuda", learning_rate=1e-3)
+            callback = CheckpointCallback(1, str(tmp_path / str(parts)))
+            if i > 0:
+                callback.restore(model, load_latest(tmp_path / str(parts))[1])
+            model.learn(n_rollouts * ROLLOUT, callback, reset_num_timesteps=i == 0)
+        ends.append(parameters(model))
+    for name, value in ends[0].items():
+        # Sums there may have another order each time
+        th.testing.assert_close(ends[1][name], value, rtol=1e-4, atol=1e-4, msg=partial("{}: {}".format, name))
 
 
 @given(shapes=st.lists(st.lists(st.integers(0, 5), max_size=3), max_size=6), seed=st.integers(0, 99))
@@ -160,7 +233,7 @@ def test_filling_a_meta_batch_changes_none_of_its_rows(tiny_pearl: MakePEARL) ->
     data = uneven(model)(5, meta_batch_size=6, context_size=9, n_labelled=256)
     full = padded(data, 6 * 9 + 1, 6 * 5 + 1, 30)
     assert full.lengths.sum() == 31 and full.context.lengths.sum() == 55 and len(full.lengths) == 7
-    assert full.task_weights.sum() == pytest.approx(1.0) and full.task_weights[-1] == 0
+    assert full.task_weights.sum().item() == pytest.approx(1.0) and full.task_weights[-1] == 0
     for own, before in zip(tensors_of(full), tensors_of(data), strict=True):
         part = own[tuple(slice(n) for n in before.shape)]
         assert th.equal(part, before)
