@@ -424,6 +424,6 @@ except gymnasium.error.DependencyNotInstalled as error:
     environment = {**os.environ, "MUJOCO_GL": how}
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
     assert result.stdout.splitlines() == [
-        f"MuJoCo cannot draw by what MUJOCO_GL asks for, {how}: install that library, take another of egl, osmesa and glfw, or "
-        "unset MUJOCO_GL, which is needed for pictures alone."
+        f"MuJoCo cannot draw by what MUJOCO_GL asks for, {how}: install that library, take another of egl, osmesa and glfw, "
+        "or unset MUJOCO_GL, which is needed for pictures alone."
     ]
