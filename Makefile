@@ -31,7 +31,7 @@ demo: .venv/.basics ## meta-train on SparsePointRobot-v0, then adapt to unseen t
 	$(BIN)/sb3-htr plot runs/demo --only learning -o runs/demo
 
 test: $(STAMP) ## run the tests
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal
 
 lint: $(STAMP) ## check style, types and the direction of imports
 	$(BIN)/ruff check .
