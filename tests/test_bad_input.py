@@ -133,7 +133,7 @@ def test_an_unknown_id_is_gymnasiums_business(tiny_pearl: MakePEARL) -> None:
         ),
         ({"replay_buffer_kwargs": {"relabel_probability": -1}}, "relabel_probability is -1"),
         ({"buffer_size": 10}, "buffer_size is 10, too small"),
-        ({"policy": "CnnPolicy"}, "CnnPolicy unknown"),
+        ({"policy": "CnnPolicy"}, r"PEARL has no policy 'CnnPolicy': expected one of \['MlpPolicy'\], or a class"),
     ],
 )
 def test_settings(kwargs: dict[str, Any], message: str) -> None:

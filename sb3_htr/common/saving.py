@@ -7,6 +7,7 @@ from typing import Any, ClassVar, TypeVar
 
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_htr.common.atomic import atomic_path
@@ -23,6 +24,17 @@ def with_suffix(path: Any, suffix: str) -> pathlib.Path:
     """
     path = pathlib.Path(path)
     return path if path.suffix else path.with_suffix(suffix)
+
+
+def _beside(folder: pathlib.Path) -> pathlib.Path:
+    """The model that ``save`` has put beside a folder of its name, where SB3 would try to read the folder."""
+    path = with_suffix(folder, ".zip")
+    if not path.is_file():
+        models = sorted(file.name for file in folder.glob("*.zip"))
+        raise IsADirectoryError(
+            f"{folder} is a folder, expected a model file{f', such as one of {models} in it' * bool(models)}."
+        )
+    return path
 
 
 class CheckedFiles(BaseAlgorithm):
@@ -53,12 +65,15 @@ class CheckedFiles(BaseAlgorithm):
             given
         :return: the model
         :raises ValueError: for an unknown setting, or a file of another algorithm
+        :raises OSError: if there is no such file, or it is a folder
         """
         cls.check_names(kwargs, keywords_of(BaseAlgorithm.load))
         if "stats_window_size" in kwargs:  # has another name in SB3's models
             kwargs["_stats_window_size"] = kwargs.pop("stats_window_size")
         if str(path).endswith(".pt"):
             raise ValueError(f"{path} is no model: an agent that is adapted to a task is loaded by AdaptedAgent.load.")
+        if not isinstance(path, io.IOBase) and pathlib.Path(path).is_dir():
+            path = _beside(pathlib.Path(path))
         if {"ent_coef", "replay_buffer_kwargs"} & kwargs.keys():
             theirs = cls._settings(path, kwargs.get("custom_objects"))
             if "ent_coef" in kwargs and isinstance(kwargs["ent_coef"], str) != isinstance(theirs.get("ent_coef"), str):
@@ -82,6 +97,12 @@ class CheckedFiles(BaseAlgorithm):
         if isinstance(path, io.IOBase):
             path.seek(0)
         return data or {}
+
+    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
+        if policy_name not in self.policy_aliases:
+            expected = f"expected one of {[*self.policy_aliases]}, or a class derived from theirs"
+            raise ValueError(f"{type(self).__name__} has no policy {policy_name!r}: {expected}.")
+        return self.policy_aliases[policy_name]
 
     def _setup_model(self) -> None:
         self._check_policy_class()

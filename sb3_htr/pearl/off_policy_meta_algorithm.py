@@ -118,7 +118,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
             env = self._wrap_env(env)
             checks.check_spaces(env)
         policy_class = self.policy_aliases.get(policy) if isinstance(policy, str) else policy
-        if policy_class is not None:  # else SB3 says so
+        if policy_class is not None:  # else CheckedFiles says so
             check_keywords("policy_kwargs", policy_kwargs or {}, policy_class)
         super().__init__(
             policy=policy,

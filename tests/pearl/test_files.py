@@ -443,3 +443,17 @@ def test_a_path_that_cannot_be_opened_is_not_called_damaged(tmp_path: Path) -> N
     for load in (load_arrays, AdaptedAgent.load, partial(load_untrusted, env=ENV_ID)):
         with pytest.raises(IsADirectoryError):
             load(folder)
+
+
+def test_a_folder_of_a_models_name_is_not_in_its_way(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    """``save`` writes beside it, and SB3's ``load`` would read the folder."""
+    folder = tmp_path / "model"
+    folder.mkdir()
+    with pytest.raises(IsADirectoryError, match=r"model is a folder, expected a model file\.$"):
+        PEARL.load(folder)
+    tiny_pearl().save(folder)
+    assert PEARL.load(str(folder)).seed == 0
+    with pytest.raises(
+        IsADirectoryError, match=r"is a folder, expected a model file, such as one of \['model.zip'\] in it\.$"
+    ):
+        PEARL.load(tmp_path)
