@@ -28,8 +28,10 @@ try:
 except ImportError as error:
     raise DependencyNotInstalled('MuJoCo is missing or too old: run `pip install "sb3_htr[mujoco]"`.') from error
 except (AttributeError, RuntimeError) as error:  # of PyOpenGL without the library, and of MuJoCo for an unknown name
+    if "MUJOCO_GL" not in os.environ:
+        raise
     raise DependencyNotInstalled(
-        f"MuJoCo cannot draw by what MUJOCO_GL asks for, {os.environ.get('MUJOCO_GL')}: install that library, take another of "
+        f"MuJoCo cannot draw by what MUJOCO_GL asks for, {os.environ['MUJOCO_GL']}: install that library, take another of "
         "egl, osmesa and glfw, or unset MUJOCO_GL, which is needed for pictures alone."
     ) from error
 
