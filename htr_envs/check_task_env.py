@@ -272,8 +272,10 @@ def _check_sparse(family: TaskFamily, traj: Trajectory, own_tasks: FloatArray) -
     tasks = np.concatenate((own_tasks, family.train_tasks))
     task_rewards = family.compute_reward(traj, tasks) - traj.task_free_reward
     failures = task_rewards[~family.is_success(traj, tasks)]
-    if len(failures) == 0:
-        return
+    advice = "is_success asks for too little, look at its threshold and units."
+    _require(
+        len(failures) > 0, f"Every step of a random episode solves every training task, so nothing can be learnt: {advice}"
+    )
     more = float(np.abs(failures).max())
     leak = (
         f"The sparse reward of an unsuccessful step is not 0 (beside task_free_reward) but {more:.2g}, which leaks the task: "

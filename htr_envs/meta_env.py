@@ -284,6 +284,11 @@ class MetaEnv(HasTaskFamily, gym.Env[FloatArray, FloatArray], ABC):
         state, reward, terminated = stepped
         if np.ndim(reward):
             raise ValueError(f"_step_state returned a reward of shape {np.shape(reward)}, expected a number.")
+        if not isinstance(terminated, (bool, np.bool_)):
+            raise ValueError(
+                f"_step_state returned {terminated!r} for whether the episode terminates, expected True or False: return an "
+                "observation, a reward and that, in this order."
+            )
         return action, self._remember_observation(state), reward, terminated
 
     def _current_task(self) -> tuple[int, FloatArray]:

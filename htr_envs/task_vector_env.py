@@ -165,7 +165,12 @@ class TaskVectorEnv(HasTaskFamily, VectorEnv[FloatArray, FloatArray, NDArray[Any
                 "_step_state returns observations, task-free rewards and terminations, one of each for each env: expected "
                 f"arrays of the shapes {expected}, got {given}."
             )
-        task_free_reward, terminated = np.asarray(task_free_reward), np.asarray(terminated, dtype=np.bool_)
+        task_free_reward, terminated = np.asarray(task_free_reward), np.asarray(terminated)
+        if terminated.dtype != np.bool_:
+            raise ValueError(
+                f"_step_state returns terminations of dtype {terminated.dtype}, expected bool: observations, task-free "
+                "rewards and terminations, in this order."
+            )
         final_obs = np.array(states, dtype=np.float32)
         # an axis of T = 1 makes every copy a trajectory of its own, with its own task
         traj = Trajectory(*(values[:, None] for values in (self._observations, actions, final_obs, task_free_reward)))

@@ -23,7 +23,7 @@ from helpers import ENV_ID, ROLLOUT, MakePEARL, many
 from helpers.broken_envs import LineEnv
 from htr_envs import DynamicsVectorEnv, PointRobotEnv, PointRobotFamily, PointRobotVectorEnv, check_task_env
 from htr_envs.point_robot import PointRobotDynamics
-from sb3_htr import PEARL, evaluate_adaptation, load_untrusted
+from sb3_htr import PEARL, AdaptedAgent, evaluate_adaptation, load_untrusted
 from sb3_htr.adaptation import Step
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
 from sb3_htr.common.checks import check_tasks, family_facts, get_task_family
@@ -373,9 +373,10 @@ def test_a_settings_file_that_is_not_there() -> None:
         main(["train", "--env", ENV_ID, "-conf", "pearl_pior.yml"])
 
 
-def test_a_file_is_no_module() -> None:
-    with pytest.raises(ValueError, match=r"'\./door\.py' is no name of a module: .*--gym-packages door"):
-        main(["train", "--env", ENV_ID, "--gym-packages", "./door.py"])
+@pytest.mark.parametrize("file", ["./door.py", "door.py"])
+def test_a_file_is_no_module(file: str) -> None:
+    with pytest.raises(ValueError, match=rf"'{file}' is no name of a module: .*--gym-packages door"):
+        main(["train", "--env", ENV_ID, "--gym-packages", file])
 
 
 def test_settings_in_the_wrong_place() -> None:
@@ -859,6 +860,20 @@ def test_a_longer_time_limit_needs_other_room(tiny_pearl: MakePEARL) -> None:
         model.set_env(make_task_vec_env(ENV_ID, 4, env_kwargs={"max_episode_steps": 40}))
 
 
+@pytest.mark.parametrize("end", [{"speed": 0.1}, -0.01, float("nan"), "False", None, np.array([False])])
+def test_an_end_of_an_episode_that_is_no_truth_value_is_named(end: Any) -> None:
+    """gymnasium's own order has an info in its place, which is true: each episode would have one step."""
+
+    class InfoInItsPlace(LineEnv):
+        def _step_state(self, action: Any) -> Any:
+            return *super()._step_state(action)[:2], end
+
+    env = InfoInItsPlace()
+    env.reset()
+    with pytest.raises(ValueError, match="for whether the episode terminates, expected True or False: return an observation"):
+        env.step(np.zeros(1, dtype=np.float32))
+
+
 def test_an_entropy_coefficient_of_another_kind_than_the_files(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
     for theirs, ours in (("auto", 0.01), (0.01, "auto")):
         tiny_pearl(ent_coef=theirs).save(tmp_path / "model")
@@ -877,6 +892,19 @@ def test_a_step_of_all_envs_tells_of_each(tiny_pearl: MakePEARL, monkeypatch: py
         ValueError, match=r"expected arrays of the shapes \(\(4, 2\), \(4,\), \(4,\)\), got \(\(4, 2\), \(\), \(4,\)\)"
     ):
         env.step(np.zeros((4, 2), dtype=np.float32))
+    monkeypatch.setattr(vector_env, "_step_state", lambda actions: (np.zeros((4, 2), np.float32), np.zeros(4), np.zeros(4)))
+    with pytest.raises(ValueError, match="_step_state returns terminations of dtype float64, expected bool"):
+        env.step(np.zeros((4, 2), dtype=np.float32))
+
+
+def test_a_z_that_is_none_is_no_z_to_act_by(tiny_pearl: MakePEARL) -> None:
+    """It would be saved, and found damaged; or give actions that are no numbers."""
+    policy, none = tiny_pearl().policy, np.zeros(0)
+    for z in (np.zeros((1, 3)), np.full(3, np.nan)):
+        with pytest.raises(ValueError, match=r"z is .*, expected finite numbers of shape \(3,\)"):
+            AdaptedAgent(policy, z, none, none.astype(bool))
+    with pytest.raises(ValueError, match=r"z, the state, is .*nan.*, expected finite numbers: no action follows from it"):
+        policy.predict(np.zeros(2, dtype=np.float32), (np.full((1, 3), np.nan, dtype=np.float32),))
 
 
 @pytest.mark.parametrize("lengths", [(20, 1000), (1000, 20)])

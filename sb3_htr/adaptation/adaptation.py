@@ -143,6 +143,8 @@ class Adaptation:
         z, shape = np.asarray(self.explorer.z, dtype=np.float32), (self.n_envs, self.policy.latent_dim)
         if z.shape != shape:
             raise ValueError(f"The z of the explorer {self.explorer.name!r} has shape {z.shape}, expected {shape}.")
+        if not np.isfinite(z).all():
+            raise ValueError(f"The z of the explorer {self.explorer.name!r} is {z}, expected finite numbers.")
         return z
 
     def act(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:

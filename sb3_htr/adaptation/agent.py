@@ -1,7 +1,7 @@
 """What :meth:`sb3_htr.PEARL.adapt` returns."""
 
 import os
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch as th
@@ -31,6 +31,9 @@ class AdaptedAgent:
     def __init__(self, policy: BasePolicy, z: np.ndarray, returns: np.ndarray, successes: np.ndarray) -> None:
         self.policy = policy
         self.z = np.array(z, dtype=np.float32)
+        shape = (cast(Any, policy).latent_dim,)
+        if self.z.shape != shape or not np.isfinite(self.z).all():
+            raise ValueError(f"z is {self.z}, expected finite numbers of shape {shape}: of several envs, that of one.")
         self.returns = returns
         self.successes = successes
 

@@ -49,6 +49,8 @@ class LatentPolicy(BasePolicy):
                 else f"{type(state).__name__} of shape {np.shape(state)}"
             )
             raise ValueError(f"state is {what}, expected a tuple of one array, z, of shape ({n}, {self.latent_dim}).")
+        if state is not None and not np.isfinite(state[0]).all():
+            raise ValueError(f"z, the state, is {state[0]}, expected finite numbers: no action follows from it.")
         if not isinstance(observation, dict) and not np.isfinite(observation).all():
             raise ValueError(f"The observation is {observation}, expected finite numbers: no action follows from it.")
         z = np.zeros((1, self.latent_dim), dtype=np.float32) if state is None else state[0]

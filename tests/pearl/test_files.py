@@ -379,7 +379,7 @@ def test_what_acts_in_a_way_of_its_own_is_not_loaded_as_something_else(tiny_pear
             load_untrusted(tmp_path / name, ENV_ID)
         assert PEARL.load(tmp_path / name).policy is not None
     load_untrusted(tmp_path / "explorer", ENV_ID, explorer="prior")
-    agent = AdaptedAgent(own.policy, np.zeros(5, dtype=np.float32), np.zeros(0), np.zeros(0, dtype=bool))
+    agent = AdaptedAgent(own.policy, np.zeros(3, dtype=np.float32), np.zeros(0), np.zeros(0, dtype=bool))
     with pytest.raises(ValueError, match="acts in a way of its own: save the model"):
         agent.save(tmp_path / "agent")
 

@@ -431,3 +431,27 @@ def test_the_command_that_is_printed_to_go_on_is_taken(
     assert ("--trust" in line) == trust
     assert main(shlex.split(line)[4:]) == 0
     assert PEARL.load(run_folder(tmp_path) / f"{ENV_ID}.zip").num_timesteps == 720
+
+
+def test_an_empty_folder_is_the_working_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of a variable that is not set; and not the root of the disk."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["train", "--env", ENV_ID, "-n", "1", "-f", "", "--eval-freq", "-1", "--verbose", "0", "-params", *SMALL]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["htr-ser"]
+
+
+def test_a_run_that_may_not_go_on_has_the_plan_that_it_had(
+    unbroken: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Asked for again, it would train as much longer as it was refused."""
+
+    def refuse(*_: Any) -> None:
+        raise ValueError("The env has other rewards.")
+
+    run = run_folder(tmp_path)
+    shutil.copytree(unbroken, run)
+    with monkeypatch.context() as context:
+        context.setattr("sb3_htr.zoo.run.manager.CheckpointCallback.restore", refuse)
+        with pytest.raises(ValueError, match="other rewards"):
+            main(["train", "--resume", str(run), "-n", "240"])
+    assert json.loads((run / "run.json").read_text()) == json.loads((unbroken / "run.json").read_text())

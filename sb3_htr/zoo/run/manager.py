@@ -76,6 +76,8 @@ class MetaExperimentManager(ExperimentManager):
         self._unique = kwargs.get("uuid_str", "")
         self.resumed = resumed
         self._claimed: Path | None = None
+        # The record of a run that goes on otherwise than it was begun
+        self._going_on: dict[str, Any] | None = None
         self._lock: SystemLock | None = None
         self._interrupted = False
 
@@ -241,7 +243,7 @@ class MetaExperimentManager(ExperimentManager):
 
     def create_log_folder(self) -> None:
         """Make the run's folder, or take the one of the run that goes on; a search has none."""
-        self.log_path = f"{self.log_folder}/{self.method.name}/"
+        self.log_path = f"{Path(self.log_folder, self.method.name)}/"  # of an empty folder, not in the root
         if self.optimize_hyperparameters:
             return
         if self.tensorboard_log:
@@ -291,6 +293,8 @@ class MetaExperimentManager(ExperimentManager):
             assert self._checkpointing is not None, "a run that has a checkpoint makes them"
             self._checkpointing.restore(cast(Any, model), self._checkpoint)
             done = model.num_timesteps
+            if self._going_on is not None:  # not before: a run that is refused has the plan that it had
+                self._write_record(self._going_on)
         log_interval = {-1: 1}.get(self.log_interval, self.log_interval if self.log_interval > 0 else None)
         with contextlib.ExitStack() as on_failure, _soft_interrupt(self._checkpointing):
             assert self._lock is not None
@@ -425,8 +429,7 @@ class MetaExperimentManager(ExperimentManager):
                     "not end as it would have. Its run.json names both from now on.",
                     stacklevel=2,
                 )
-            if going_on != record:
-                self._write_record(going_on)
+            self._going_on = going_on if going_on != record else None
             return
         super()._save_config(saved_hyperparams)
         run = {

@@ -158,7 +158,7 @@ def import_packages(named: Iterable[str], asked_for: Iterable[str] = (), file: o
                 f"{file} asks for the module {name!r}, and importing it runs it: add --gym-packages {name} if you know it."
             )
     for name in dict.fromkeys((*named, *asked_for)):
-        if not all(part.isidentifier() for part in name.split(".")):
+        if name.endswith(".py") or not all(part.isidentifier() for part in name.split(".")):
             raise ValueError(
                 f"{name!r} is no name of a module: give it without folder and .py, as in --gym-packages {Path(name).stem}, "
                 "and work in its folder, or add that to PYTHONPATH."
