@@ -260,7 +260,7 @@ class MetaEnv(HasTaskFamily, gym.Env[FloatArray, FloatArray], ABC):
 
         :param action: the action, shape (act_dim,).
         :return: next observation (obs_dim,), reward, terminated, False, info.
-        :raises ValueError: if the action has the wrong shape, or is not finite.
+        :raises ValueError: if the action has the wrong shape, or is not finite; or for what ``_step_state`` may not return.
         :raises gymnasium.error.ResetNeeded: before the first reset.
         """
         _, observation, reward, terminated = self._checked_step(action)

@@ -151,7 +151,7 @@ class TaskVectorEnv(HasTaskFamily, VectorEnv[FloatArray, FloatArray, NDArray[Any
 
         :param actions: the actions, shape (num_envs, act_dim).
         :return: observations (num_envs, obs_dim), rewards, terminations, truncations (num_envs,), infos as in the class.
-        :raises ValueError: if the actions have the wrong shape, or are not finite.
+        :raises ValueError: if the actions have the wrong shape, or are not finite; or for what ``_step_state`` may not return.
         :raises gymnasium.error.ResetNeeded: before the first reset.
         """
         if self._observations is None:

@@ -17,7 +17,7 @@ from sb3_htr.htr import EpisodeClustering
 from sb3_htr.zoo.cli import main
 
 # 100,000 in the nightly run
-N_UPDATES = int(os.environ.get("SB3_HTR_UPDATES", 1_500))
+N_UPDATES = int(os.environ.get("SB3_HTR_UPDATES", 3_000))
 
 
 def resident_bytes() -> int:
@@ -31,11 +31,11 @@ def train_with_full_buffers(n_updates: int) -> tuple[int, int]:
     """Resident bytes before and after, in a process of its own."""
     th.set_num_threads(1)
     env = make_task_vec_env(ENV_ID, 2, env_kwargs={"n_train_tasks": 2, "n_test_tasks": 1, "n_validation_tasks": 1})
-    small = {"buffer_size": 400, "n_tasks_per_rollout": 2, "n_episodes_per_task": 1, "gradient_steps": 20, "batch_size": 2}
+    small = {"buffer_size": 400, "n_tasks_per_rollout": 2, "n_episodes_per_task": 1, "gradient_steps": 50, "batch_size": 2}
     model = PEARL("MlpPolicy", env, **{**TINY, **small})
     model.learn(40 * 20)  # the buffers are full, allocators have what they need
     before = resident_bytes()
-    model.learn(40 * n_updates // 20, reset_num_timesteps=False)
+    model.learn(40 * n_updates // 50, reset_num_timesteps=False)
     assert model._n_updates >= n_updates
     return before, resident_bytes()
 

@@ -26,6 +26,7 @@ class AdaptedAgent:
     :param z: (latent_dim,) float32, the task variable
     :param returns: (n_episodes,), returns of the adaptation episodes
     :param successes: (n_episodes,) bool, whether each adaptation episode solved the task
+    :raises ValueError: for a z of another shape than the policy's, or without finite numbers
     """
 
     def __init__(self, policy: BasePolicy, z: np.ndarray, returns: np.ndarray, successes: np.ndarray) -> None:
