@@ -42,7 +42,7 @@ PAPER_SIZES: dict[str, Any] = {
         "normalize_observations": False,
     },
 }
-# Times that each of several things is timed, by turns
+# Times that each of several things is timed, by turns, where nothing else is said
 ROUNDS = 9
 
 
@@ -81,23 +81,24 @@ def seconds(function: Callable[[], Any], n: int) -> float:
     return (time.perf_counter() - start) / n
 
 
-def by_turns(durations: dict[str, Callable[[], float]]) -> dict[str, np.ndarray]:
+def by_turns(durations: dict[str, Callable[[], float]], n_rounds: int = ROUNDS) -> dict[str, np.ndarray]:
     """
     Time several things by turns, so that what else the machine does meets all of them.
 
     :param durations: each measures itself once
-    :return: (ROUNDS,) durations of each
+    :param n_rounds: times that each is timed, after one that warms up
+    :return: (n_rounds,) durations of each
     """
     for duration in durations.values():
         duration()
-    times = [[duration() for duration in durations.values()] for _ in range(ROUNDS)]
+    times = [[duration() for duration in durations.values()] for _ in range(n_rounds)]
     return dict(zip(durations, np.array(times).T, strict=True))
 
 
 def faster(ours: np.ndarray, reference: np.ndarray) -> float:
     """
-    :param ours: (ROUNDS,) durations
-    :param reference: (ROUNDS,) durations
+    :param ours: (n,) durations
+    :param reference: (n,) durations
     :return: median ratio
     """
     return statistics.median(reference / ours)

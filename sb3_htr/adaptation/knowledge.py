@@ -10,6 +10,7 @@ from sb3_htr.adaptation.policy import ContextualPolicy
 from sb3_htr.adaptation.reward_watch import RewardWatch
 from sb3_htr.adaptation.task_bank import MAX_HINDSIGHT_TASKS, MAX_TRAIN_TASKS, TaskBank
 from sb3_htr.common.linear import left_to_torch
+from sb3_htr.common.segments import segment_sum
 
 # Quantiles of what unrewarded and rewarded steps return beside what the model says is task-free; rewards are told from the
 # model's errors by the middle between the two
@@ -153,8 +154,9 @@ class LatentKnowledge(nn.Module):
         for of_chunk in th.arange(len(data), device=z.device).split(CHUNK):
             states = model.state_tower(next_obs[of_chunk])
             chance = model.success_logits(states, tasks).sigmoid() * success[of_chunk, None]
-            overlap.index_add_(0, episode[of_chunk], chance)
-            earned.index_add_(0, episode[of_chunk], chance * model.success_rewards(states, tasks).clamp(min=0))
+            of_episode = th.bincount(episode[of_chunk], minlength=len(z))
+            overlap += segment_sum(chance, of_episode)
+            earned += segment_sum(chance * model.success_rewards(states, tasks).clamp(min=0), of_episode)
         n_rewarded = th.zeros_like(z[:, 0]).index_add(0, episode, success.to(z.dtype)).clamp(min=1)[:, None]
         overlap /= n_rewarded
         share = (earned / earned.diag().clamp(min=1e-6)[:, None]).clamp(0, 1.2).fill_diagonal_(1)

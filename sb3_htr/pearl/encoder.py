@@ -6,6 +6,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_htr.common.linear import with_fast_layers
+from sb3_htr.common.segments import segment_sum
 
 # Smallest variance of a factor, as in PEARL's reference implementation
 MIN_VARIANCE = 1e-7
@@ -64,7 +65,7 @@ class ContextEncoder(nn.Module):
         # Of a slice of columns, softplus takes eight times as long
         precision = self._precision(raw.contiguous())
         factors = th.cat([precision, precision * mean], dim=1)
-        return state + th.segment_reduce(factors, "sum", lengths=lengths, axis=0, unsafe=True)
+        return state + segment_sum(factors, lengths)
 
     def _precision(self, raw: th.Tensor) -> th.Tensor:
         """Of factors, (n, latent_dim), from what the network says of it."""

@@ -10,6 +10,7 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_htr.adaptation.explorers import Explorer
 from sb3_htr.common.matmul import PRECISIONS, matmul_precision
+from sb3_htr.common.segments import spread
 from sb3_htr.common.settings import check_flags, check_numbers
 from sb3_htr.common.type_aliases import MultiTaskSamples, RewardLabels
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
@@ -282,12 +283,12 @@ class PEARL(OffPolicyMetaAlgorithm):
     def _gradient_step(self, data: MultiTaskSamples, update_target: bool) -> Outcome:
         """The part of an update that a GPU does, and that can be captured: it waits for no value."""
         # Each task has the same weight in a mean over transitions
-        weight = (data.task_weights / data.lengths).repeat_interleave(data.lengths, output_size=len(data.rewards))
+        weight = spread(data.task_weights / data.lengths, data.lengths, len(data.rewards))
         # One backward pass through the encoder: it learns from the critics' errors, the KL term and the reward model's errors
         mean, variance = self.policy.infer(data.context)
         z = mean + variance.sqrt() * th.randn_like(mean)
         kl = (kl_to_prior(mean, variance) * data.task_weights).sum()
-        z_rows = z.repeat_interleave(data.lengths, dim=0, output_size=len(data.rewards))
+        z_rows = spread(z, data.lengths, len(data.rewards))
         obs, next_obs = self.policy.normalize(data.observations), self.policy.normalize(data.next_observations)
         obs_z = th.cat([obs, z_rows], dim=1)
         ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp()
