@@ -22,7 +22,7 @@ SIZES: dict[str, tuple[dict[str, Any], int]] = {
     "plain PEARL (K = 0), paper's sizes": ({"relabel_probability": 0.0, **PAPER_SIZES}, 4),
 }
 # Two rollouts, and what is learnt after each; with all that is done once, and no evaluation
-TRAINING_STEPS, TRAINING_ROUNDS = 8_000, 3
+TRAINING_STEPS, TRAINING_ROUNDS = 8_000, 2
 
 
 def update_seconds(model: PEARL, n_updates: int) -> float:
