@@ -85,7 +85,7 @@ class PEARL(OffPolicyMetaAlgorithm):
     :param matmul_precision: of matrix products in updates, as for ``torch.set_float32_matmul_precision``. ``"medium"`` rounds
         their factors to bfloat16, which is faster where the processor has such products (docs/performance.md)
     :param cuda_graph: an update is one CUDA graph, for meta-batches that one task more, without a weight, fills up to as many
-        rows as there can be: six times as fast on a GPU (docs/performance.md). On a CPU they are filled up alike, and nothing is
+        rows as there can be: six times as fast on a GPU (docs/performance.md). On a CPU they are filled up alike, nothing is
         captured
     :param stats_window_size: episodes over which logged returns are averaged
     :param tensorboard_log: folder for TensorBoard, none by default
