@@ -111,7 +111,7 @@ def check_acts_in_floats(action_space: spaces.Space[Any]) -> None:
         )
 
 
-def check_fits(env: VecEnv, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+def check_fits(env: GymEnv, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
     """
     :param env: to adapt in; a robot need not say how its observations are bounded, and the spaces may have another dtype
     :param observation_space: of training

@@ -9,7 +9,9 @@ import zipfile
 from collections.abc import Iterable, Iterator
 from typing import IO, Any
 
+import numpy as np
 import torch as th
+from gymnasium import spaces
 
 # What a file may unpack to
 MAX_BYTES = 2**30
@@ -38,6 +40,18 @@ def read_model(path: str | os.PathLike[str], names: Iterable[str]) -> tuple[dict
     if not all(isinstance(value, dict) for value in (data, *weights.values())):
         raise TypeError
     return data, weights
+
+
+def box_in_words(record: Any) -> spaces.Box | None:
+    """
+    :param record: of a space, as SB3 writes an object beside its pickle: its arrays are text, as numpy prints them
+    :return: the space of these bounds; None where it is no box, or one too long to be printed in full
+    """
+    try:
+        low, high = (np.array(re.sub(r"[\[\]]", " ", record[name]).split(), np.float64) for name in ("low", "high"))
+        return spaces.Box(low.reshape(record["_shape"]), high.reshape(record["_shape"]), dtype=np.float64)
+    except (KeyError, TypeError, ValueError, AssertionError):
+        return None
 
 
 def load_plain(file: str | os.PathLike[str] | IO[bytes]) -> Any:

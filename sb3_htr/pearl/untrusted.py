@@ -11,9 +11,9 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_htr.adaptation import explorers
-from sb3_htr.common.checks import check_spaces
+from sb3_htr.common.checks import check_fits, check_spaces
 from sb3_htr.common.errors import OPEN_ERRORS, last_line
-from sb3_htr.common.plain import Refused, read_model
+from sb3_htr.common.plain import Refused, box_in_words, read_model
 from sb3_htr.common.saving import with_suffix
 from sb3_htr.common.settings import keywords_of
 from sb3_htr.common.vec_env import make_task_vec_env
@@ -55,12 +55,12 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
     anew.
 
     :param path: file of ``PEARL.save``
-    :param env: env of the same spaces; its spaces are not read from the file
+    :param env: env of the same spaces, which are compared with what the file says of them in words
     :param device: torch device
     :param kwargs: arguments of PEARL, in place of those of the file
     :return: a model to predict, adapt and evaluate with
     :raises OSError: if there is no such file, or it cannot be opened
-    :raises ValueError: if it is no such file, or its weights do not fit
+    :raises ValueError: if it is no such file, or its weights or spaces do not fit
     """
     # As SB3's load does
     path = path if os.path.exists(path) else with_suffix(path, ".zip")
@@ -93,6 +93,7 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
     for name in ("policy_kwargs", "replay_buffer_kwargs"):
         kwargs[name] = {**settings.pop(name), **(kwargs.get(name) or {})}
     _check_shapes(path, weights["policy"], env, kwargs["policy_kwargs"])
+    check_fits(env, *(box_in_words(data.get(name)) or getattr(env, name) for name in ("observation_space", "action_space")))
     model = PEARL("MlpPolicy", env, device=device, _init_setup_model=False, **{**settings, **kwargs})
     # Which settings follow from: where the env has others, that is warned of
     vars(model).update({name: data[name] for name in ("max_episode_steps", "n_rollout_tasks") if type(data.get(name)) is int})

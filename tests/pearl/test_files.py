@@ -19,10 +19,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium.wrappers import RescaleAction, RescaleObservation
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from stable_baselines3 import SAC, HerReplayBuffer
-from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.save_util import data_to_json, load_from_zip_file
 from stable_baselines3.common.utils import LinearSchedule
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL, many, parameters, with_policy
@@ -30,6 +32,7 @@ from helpers.bombs import Bomb, bombs
 from sb3_htr import PEARL, AdaptedAgent, evaluate_adaptation, load_untrusted
 from sb3_htr.adaptation import Aggregate, Belief, Prior
 from sb3_htr.common.arrays import load_arrays
+from sb3_htr.common.plain import box_in_words
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr import EpisodeClustering
 from sb3_htr.pearl.pearl import LEARNING_RATE
@@ -91,6 +94,40 @@ def test_loading_an_untrusted_model_runs_no_code(tiny_pearl: MakePEARL, tmp_path
         load_untrusted(tmp_path / "bomb.zip", ENV_ID)
     load_untrusted(tmp_path / "bomb.zip", ENV_ID, explorer="belief")
     assert not fuse.exists()
+
+
+def test_an_untrusted_model_is_refused_in_an_env_of_other_bounds(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    tiny_pearl().save(tmp_path / "model")
+    for wrapper, name in ((RescaleObservation, "Observation"), (RescaleAction, "Action")):
+        other = wrapper(gym.make(ENV_ID), np.float32(-3), np.float32(3))
+        with pytest.raises(ValueError, match=rf"{name} spaces do not match: Box\(-3\.0, 3\.0, \(2,\), float32\) here"):
+            load_untrusted(tmp_path / "model", other)
+
+
+@given(
+    bounds=arrays(np.float32, (2, 6), elements=st.floats(-1e6, 1e6, width=32)).map(lambda a: np.sort(a, axis=0)),
+    unbounded=st.booleans(),
+    shape=st.sampled_from([(6,), (2, 3)]),
+)
+def test_a_space_in_words_is_the_space(bounds: np.ndarray, unbounded: bool, shape: tuple[int, ...]) -> None:
+    low, high = bounds.reshape(2, *shape)
+    space = gym.spaces.Box(np.where(unbounded, -np.inf, low).astype(np.float32), high)
+    words = box_in_words(json.loads(data_to_json({"space": space}))["space"])
+    assert words is not None and words.shape == shape
+    np.testing.assert_allclose([words.low, words.high], [space.low, space.high], rtol=1e-5, atol=1e-8)
+
+
+def test_a_space_that_was_not_printed_in_full_is_not_guessed() -> None:
+    long = json.loads(data_to_json({"space": gym.spaces.Box(np.arange(2000.0), np.arange(2000.0) + 1)}))["space"]
+    for record in (
+        long,
+        None,
+        "Box",
+        {},
+        {"low": 3, "high": [1], "_shape": [1]},
+        {"low": "[1.]", "high": "[0.]", "_shape": [1]},
+    ):
+        assert box_in_words(record) is None, record
 
 
 def test_explorers_can_be_given_in_place_of_those_of_the_file(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
