@@ -114,7 +114,7 @@ def probe(source: GoalEnvSource) -> gym.Env[Any, Any]:
 
     :param source: where it comes from.
     :return: the env; what it is in the middle of means nothing.
-    :raises ValueError: if it is no GoalEnv.
+    :raises ValueError: if it is no GoalEnv, or one of the old gym.
     """
     env = source.make()
     space, action_space = env.observation_space, env.action_space
@@ -126,7 +126,16 @@ def probe(source: GoalEnvSource) -> gym.Env[Any, Any]:
         )
     if not _is_flat(action_space) or not np.issubdtype(action_space.dtype, np.floating):
         raise ValueError(f"The action space of {source.spec.id} is {action_space}, expected a one-dimensional Box of floats.")
+    if not (isinstance(returned := env.reset(seed=0), tuple) and len(returned) == 2):
+        raise ValueError(_is_old(source))
     return env
+
+
+def _is_old(source: GoalEnvSource) -> str:
+    return (
+        f"{source.spec.id} has the interface of the old gym: reset must return observation and info, and step must return "
+        "observation, reward, terminated, truncated and info."
+    )
 
 
 def _is_flat(space: spaces.Space[Any] | None) -> bool:
@@ -250,7 +259,9 @@ def _check_steps(source: GoalEnvSource) -> None:
     env.action_space.seed(0)
     env.reset(seed=0)
     for _ in range(N_STEPS):
-        observation, reward, terminated, truncated, _ = env.step(env.action_space.sample())
+        if len(returned := env.step(env.action_space.sample())) != 5:
+            raise ValueError(_is_old(source))
+        observation, reward, terminated, truncated, _ = returned
         expected = float(goal_rewards(source, observation["achieved_goal"], observation["desired_goal"]))
         if float(reward) != expected:
             raise ValueError(

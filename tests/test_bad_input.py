@@ -983,6 +983,14 @@ def test_a_robot_that_returns_something_else(returned: Any, message: str, tiny_p
         tiny_pearl().adapt(robot)
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_robot_of_the_old_gym(dim: int, tiny_pearl: MakePEARL) -> None:
+    robot = Robot(20)
+    robot.reset = lambda **_: np.zeros(dim, dtype=np.float32)  # type: ignore[method-assign]
+    with pytest.raises(ValueError, match="an env's reset must return observation and info"):
+        tiny_pearl().adapt(robot)
+
+
 def test_what_a_wrapper_complains_of_is_said_as_it_is(tiny_pearl: MakePEARL) -> None:
     class Careful(VecEnvWrapper):
         def reset(self) -> Any:

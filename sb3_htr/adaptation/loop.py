@@ -2,19 +2,21 @@
 
 import traceback
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, dummy_vec_env
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_htr.adaptation.adaptation import Step
 from sb3_htr.common.checks import get_max_episode_steps
 
 # An adaptation gives up after an episode of so many times those of training: an env that never ends one would hang
 ENDLESS = 10
+RESET_RETURNS = "an env's reset must return observation and info"
 # Functions of SB3's DummyVecEnv, and what an env returned that cannot be stored there
 NOT_STORED = {
+    "reset": RESET_RETURNS,
     "_save_obs": "an env's observations must have the shape of its observation_space",
     "step_wait": "an env's reward must be a number",
 }
@@ -80,7 +82,8 @@ def adaptation_steps(
     remaining = np.full(env.num_envs, n_episodes)
     while (remaining > 0).any():
         actions = act(obs)
-        new_obs, rewards, dones, infos = _step(env, unscale_action(actions))
+        with _returns_are_named():
+            new_obs, rewards, dones, infos = env.step(unscale_action(actions))
         assert isinstance(new_obs, np.ndarray)
         next_obs = new_obs
         ended = np.flatnonzero(dones)
@@ -106,20 +109,37 @@ def adaptation_steps(
         remaining -= dones
 
 
+def first_observations(env: VecEnv) -> np.ndarray:
+    """
+    :param env: to adapt in
+    :return: (n_envs, obs_dim), after a reset
+    :raises ValueError: if an env returns something else there than observation and info, as those of the old gym do
+    """
+    with _returns_are_named():
+        obs = env.reset()
+    for info in env.unwrapped.reset_infos:
+        # Of an observation of two numbers, the second
+        if not isinstance(info, dict):
+            raise ValueError(f"{RESET_RETURNS}, but a {type(info).__name__} was in the place of the info.")
+    return np.asarray(obs)
+
+
 def _task_ids(env: VecEnv) -> list[Any]:
     """As the envs told at their latest resets; None where they do not."""
     return [info.get("task_id") for info in env.unwrapped.reset_infos]
 
 
-def _step(env: VecEnv, actions: np.ndarray) -> VecEnvStepReturn:
+@contextmanager
+def _returns_are_named() -> Iterator[None]:
+    """An env's returns are unpacked and stored by SB3, whose errors do not say what was expected."""
     try:
-        return env.step(actions)
+        yield
     except ValueError as error:
         # Where SB3 stores what the env returned; within the env, an error is the env's own
         last = traceback.extract_tb(error.__traceback__)[-1]
         wrong = NOT_STORED.get(last.name)
         if last.filename != dummy_vec_env.__file__ or wrong is None:
             raise
-        if "unpack" in str(error):
+        if last.name == "step_wait" and "unpack" in str(error):
             wrong = "an env's step must return observation, reward, terminated, truncated and info"
         raise ValueError(f"{error}: {wrong}") from error

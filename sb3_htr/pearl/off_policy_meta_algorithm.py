@@ -24,7 +24,7 @@ from sb3_htr.adaptation.agent import AdaptedAgent
 from sb3_htr.adaptation.explorers import Explorer, to_explorer
 from sb3_htr.adaptation.explorers.prior import FixedExploration
 from sb3_htr.adaptation.knowledge import LatentKnowledge
-from sb3_htr.adaptation.loop import adaptation_steps
+from sb3_htr.adaptation.loop import adaptation_steps, first_observations
 from sb3_htr.adaptation.task_bank import TaskBank
 from sb3_htr.common import checks
 from sb3_htr.common.atomic import atomic_path
@@ -560,7 +560,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         adaptation = self.start_adaptation(1, explorer, th.Generator().manual_seed(seed))
         returns, successes = np.zeros(n_episodes), np.zeros(n_episodes, dtype=bool)
         act = partial(adaptation.act, deterministic=deterministic)
-        obs = np.asarray(vec_env.reset())
+        obs = first_observations(vec_env)
         if task is not None and np.ndim(task) > 0:
             checks.check_tasks(vec_env, np.asarray(task, dtype=np.float32)[None])
         elif task is not None:

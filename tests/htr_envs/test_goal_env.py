@@ -160,8 +160,24 @@ class DiscreteEnv(ReachEnv):
         self.action_space = spaces.Discrete(3)
 
 
+class OldEnv(ReachEnv):
+    """Resets as the old gym did."""
+
+    def reset(self, **kwargs: Any) -> Any:
+        return super().reset(**kwargs)[0]
+
+
+class OldStepEnv(ReachEnv):
+    """Steps as the old gym did."""
+
+    def step(self, action: Any) -> Any:
+        observation, reward, terminated, _, info = super().step(action)
+        return observation, reward, terminated, info
+
+
+BAD = (CostlyEnv, InformedEnv, UnseededEnv, PlainEnv, DiscreteEnv, OldEnv, OldStepEnv)
 _class: Any
-for _class in (ReachEnv, ChoiceEnv, CostlyEnv, InformedEnv, UnseededEnv, ListEnv, CutEnv, PlainEnv, DiscreteEnv):
+for _class in (ReachEnv, ChoiceEnv, ListEnv, CutEnv, *BAD):
     gym.register(f"Toy{_class.__name__}-v0", entry_point=_class, max_episode_steps=30)
 TOY, CHOICE = "ToyReachEnv-v0", "ToyChoiceEnv-v0"
 
@@ -343,6 +359,8 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     ("ToyInformedEnv-v0", {}, "raised KeyError('reward') for goals of shape (n, goal_dim)"),
     ("ToyPlainEnv-v0", {}, "ToyPlainEnv-v0 is no GoalEnv"),
     ("ToyDiscreteEnv-v0", {}, "expected a one-dimensional Box"),
+    ("ToyOldEnv-v0", {}, "ToyOldEnv-v0 has the interface of the old gym: reset must return observation and info"),
+    ("ToyOldStepEnv-v0", {}, "ToyOldStepEnv-v0 has the interface of the old gym"),
     ("CartPole-v1", {}, "CartPole-v1 is no GoalEnv"),
 ]
 
