@@ -173,7 +173,6 @@ def _check_rewards(env: gym.Env[Any, Any], family: TaskFamily, episode: Episode,
     rewards = base.compute_reward(episode.traj, task)
     shaped = isinstance(rewards, np.ndarray) and rewards.dtype == np.float32 and rewards.shape == episode.rewards.shape
     _require(shaped, "compute_reward must return one float32 for each step, an array (..., T).")
-    _require(np.isfinite(rewards).all(), "compute_reward returned a number that is not finite.")
     _require(_same(rewards, episode.rewards), "compute_reward does not give the rewards that step gave.")
     successes = family.is_success(episode.traj, task)
     shaped = isinstance(successes, np.ndarray) and successes.dtype == np.bool_
@@ -187,14 +186,19 @@ def _has_dense(family: TaskFamily, traj: Trajectory, task: FloatArray) -> bool:
         family.compute_reward(traj, task, "dense")
     except ValueError:
         return False
+    except Exception as error:
+        told = f"compute_reward with reward_type='dense' raised {error!r}: it must return rewards, or raise a ValueError."
+        raise AssertionError(told) from error
     return True
 
 
 def _check_reward_types(family: TaskFamily, traj: Trajectory, task: FloatArray) -> None:
     reward_type = "dense" if _has_dense(family, traj, task) else "sparse"
     dense = family.compute_reward(traj, task, reward_type)
-    finite = isinstance(dense, np.ndarray) and dense.dtype == np.float32 and bool(np.isfinite(dense).all())
-    _require(finite, f"compute_reward with reward_type={reward_type!r} must return finite float32 numbers.")
+    shaped = isinstance(dense, np.ndarray) and dense.dtype == np.float32 and dense.shape == traj.task_free_reward.shape
+    _require(
+        shaped, f"compute_reward with reward_type={reward_type!r} must return one float32 for each step, an array (..., T)."
+    )
     try:
         family.compute_reward(traj, task, "no such type")
     except ValueError:
@@ -206,7 +210,9 @@ def _check_vectorized(name: str, hook: Callable[[Trajectory, Any], Any], traj: T
     length = len(traj.task_free_reward)
     rng = np.random.default_rng(0)
     orders = [rng.permutation(length) for _ in tasks]
-    plain = hook(traj, tasks[0])
+    plain, *others = (hook(traj, task) for task in tasks)
+    finite = bool(np.isfinite([plain, *others]).all())
+    _require(finite, f"{name} returned a number that is not finite, for tasks that hindsight_task named.")
     for pick in (orders[0], orders[0][: length // 2 + 1], orders[0][:1]):
         chosen = _call(f"{name} fails on some steps of an episode.", hook, _select(traj, pick), tasks[0])
         _require(_same(chosen, plain[pick]), f"{name} makes a step depend on other steps of the trajectory.")
@@ -217,7 +223,7 @@ def _check_vectorized(name: str, hook: Callable[[Trajectory, Any], Any], traj: T
     cases = (
         (batch, tasks, [hook(_select(batch, i), task) for i, task in enumerate(tasks)]),
         (batch, tasks[0], [hook(_select(batch, i), tasks[0]) for i in range(len(tasks))]),
-        (traj, tasks, [hook(traj, task) for task in tasks]),
+        (traj, tasks, [plain, *others]),
         (
             batch_of_batches,
             tasks,
@@ -240,6 +246,7 @@ def _check_pure(family: TaskFamily, traj: Trajectory) -> None:
         calls["compute_reward with reward_type='dense'"] = lambda: family.compute_reward(traj, other_task, "dense")
     first, second = ([_call(f"{name} fails on an episode.", call) for name, call in calls.items()] for _ in range(2))
     for name, result, again in zip(calls, first, second, strict=True):
+        _require(bool(np.isfinite(result).all()), f"{name} returned a number that is not finite.")
         _require(_same(result, again), f"{name} gives something else when it is called again: it must be pure.")
     unchanged = all(map(np.array_equal, before, traj))
     _require(unchanged, "A hook of the task family changes the trajectory that it is given: it must be pure.")

@@ -798,6 +798,33 @@ def test_a_hindsight_task_that_its_step_does_not_solve_is_named(
         tiny_pearl(env).learn(ROLLOUT)
 
 
+def test_a_hindsight_task_of_nan_is_named(tiny_pearl: MakePEARL) -> None:
+    """And no wrapper is blamed."""
+
+    class Unsafe(PointRobotFamily):
+        def hindsight_task(self, traj: Any, index: Any) -> Any:
+            return super().hindsight_task(traj, index) * np.float32(np.nan)
+
+    env = gym.make(ENV_ID)
+    cast(Any, env.unwrapped).task_family = Unsafe()
+    with pytest.raises(ValueError, match=r"^hindsight_task returned NaN or infinity for a step of finite numbers"):
+        tiny_pearl(env, n_tasks_per_rollout=1).learn(ROLLOUT)
+
+
+def test_a_reward_of_nan_at_the_goal_is_named(tiny_pearl: MakePEARL) -> None:
+    """Which no step of a rollout may reach."""
+
+    class Unsafe(PointRobotFamily):
+        def compute_reward(self, traj: Any, task: Any, reward_type: str = "sparse") -> Any:
+            rewards = super().compute_reward(traj, task, reward_type)
+            return np.where(super().is_success(traj, task), np.float32(np.nan), rewards)
+
+    env = gym.make(ENV_ID)
+    cast(Any, env.unwrapped).task_family = Unsafe()
+    with pytest.raises(ValueError, match=r"^compute_reward for the task that hindsight_task named returned NaN or infinity"):
+        tiny_pearl(env, n_tasks_per_rollout=1).learn(ROLLOUT)
+
+
 @pytest.mark.parametrize("factor", [0.1, 1.0, 100.0])
 def test_rewards_of_another_scale_are_warned_of(factor: float, tiny_pearl: MakePEARL) -> None:
     class Scaled(PointRobotFamily):

@@ -18,7 +18,7 @@ from sb3_htr.htr.episode_store import EpisodeStore
 from sb3_htr.htr.groups import ascending, first_rows, positions
 from sb3_htr.htr.n_step import n_step_returns, steps_ahead
 from sb3_htr.htr.relabel import RELABELLERS, Relabeller
-from sb3_htr.htr.reward_hook import check_rewards_told
+from sb3_htr.htr.reward_hook import check_achieved, check_rewards, check_rewards_told
 from sb3_htr.htr.transitions import Transitions
 
 # Of what was saved, how many rewards are compared with those of the task family
@@ -257,6 +257,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         if "achieved_task" not in info or not self.tells_rewards:
             return
         achieved = self.task_family.hindsight_task(self.transitions.trajectory(last), 0)
+        check_achieved(achieved)
         if not np.allclose(achieved, info["achieved_task"], rtol=1e-3, atol=1e-4):
             told = info["achieved_task"]
             raise ValueError(
@@ -489,10 +490,9 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         :param where: (m,) int
         :param tasks: (m, task_dim), one for each of them
         :param reward_type: ``"sparse"`` or ``"dense"``
-        :raises ValueError: if the reward hook returns NaN or infinity
+        :raises ValueError: if the reward hook returns another shape, NaN or infinity
         """
         traj = self.transitions.trajectory(rows.take(where, axis=0)[:, None])
-        reward = self.task_family.compute_reward(traj, tasks, reward_type=reward_type)[:, 0]
-        if not np.isfinite(reward).all():
-            raise ValueError("compute_reward returned NaN or infinity for a hindsight task, expected finite rewards.")
-        rows[where, self.transitions.reward] = reward
+        reward = self.task_family.compute_reward(traj, tasks, reward_type=reward_type)
+        check_rewards(reward, traj, f" with reward_type={reward_type!r}, for a hindsight task,")
+        rows[where, self.transitions.reward] = reward[:, 0]

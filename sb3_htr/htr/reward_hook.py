@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -32,7 +33,9 @@ def check_reward_hook(
     task = np.repeat([task for task, _ in episodes], [len(episode) for _, episode in episodes])
     tasks = family.train_tasks[task]
     traj = columns.trajectory(rows[:, None])
-    given, computed = rows[:, columns.reward], np.asarray(family.compute_reward(traj, tasks))[:, 0]
+    rewards = np.asarray(family.compute_reward(traj, tasks))
+    check_rewards(rewards, traj)
+    given, computed = rows[:, columns.reward], rewards[:, 0]
     successes = np.asarray(family.is_success(traj, tasks))
     if successes.dtype != np.bool_:
         raise ValueError(f"is_success must return bool, one for each step, and returned {successes.dtype}.")
@@ -57,6 +60,28 @@ def check_reward_hook(
             "a goal, and ends tell what the task is. Let the env go on up to its time limit.",
             stacklevel=2,
         )
+
+
+def check_rewards(rewards: np.ndarray, traj: Any, when: str = "") -> None:
+    """
+    :param rewards: what the reward hook returned
+    :param traj: steps, (n, 1, ...), that it was asked for
+    :param when: further words for the message
+    :raises ValueError: if it is no finite number for each of them
+    """
+    if np.shape(rewards) != (expected := np.shape(traj.task_free_reward)):
+        raise ValueError(f"compute_reward{when} returned shape {np.shape(rewards)}, expected {expected}: one for each step.")
+    if not np.isfinite(rewards).all():
+        raise ValueError(f"compute_reward{when} returned NaN or infinity, expected finite rewards.")
+
+
+def check_achieved(tasks: np.ndarray) -> None:
+    """
+    :param tasks: what ``hindsight_task`` returned
+    :raises ValueError: if it is not finite
+    """
+    if not np.isfinite(tasks).all():
+        raise ValueError("hindsight_task returned NaN or infinity for a step of finite numbers, expected a task.")
 
 
 def check_rewards_told(given: np.ndarray, computed: np.ndarray, tasks: np.ndarray) -> None:
@@ -104,12 +129,14 @@ def _check_worth(family: TaskFamily, columns: Transitions, last: np.ndarray) -> 
         raise ValueError(
             f"hindsight_task returned shape {np.shape(achieved)} for {len(last)} steps, expected {expected}: a task for each."
         )
+    check_achieved(achieved)
     if not family.is_success(traj, achieved).all():
         raise ValueError(
             "hindsight_task names a task that its own step does not solve, by is_success: hindsight would teach what did "
             "not happen. Run htr_envs.check_task_env(env) to find out more."
         )
     reward = family.compute_reward(traj, achieved)
+    check_rewards(reward, traj, " for the task that hindsight_task named")
     worth = task_reward(reward, traj.task_free_reward)[:, 0]
     if (worth <= 0).any():
         i = int(worth.argmin())

@@ -97,6 +97,34 @@ class IsSolvedByAnything(LineFamily):
         return super().distance(traj, task) / 1000
 
 
+@breaks("The reward nan is not a finite float")
+class NoRewardAtAll(LineFamily):
+    def compute_reward(self, traj: Any, task: Any, reward_type: str = "sparse") -> Any:
+        return super().compute_reward(traj, task, reward_type) * np.float32(np.nan)
+
+
+@breaks("compute_reward returned a number that is not finite, for tasks that hindsight_task named")
+class NoRewardAtTheGoal(LineFamily):
+    def compute_reward(self, traj: Any, task: Any, reward_type: str = "sparse") -> Any:
+        at_goal = self.distance(traj, task) == 0
+        return np.where(at_goal, np.float32(np.nan), super().compute_reward(traj, task, reward_type))
+
+
+@breaks("compute_reward with reward_type='dense' must return one float32 for each step")
+class DenseRewardOfTheEpisode(LineFamily):
+    def compute_reward(self, traj: Any, task: Any, reward_type: str = "sparse") -> Any:
+        rewards = super().compute_reward(traj, task, reward_type)
+        return rewards.sum(axis=-1) if reward_type == "dense" else rewards
+
+
+@breaks("compute_reward with reward_type='dense' raised NotImplementedError(): it must return rewards, or raise a ValueError")
+class DenseRewardToBeDone(LineFamily):
+    def compute_reward(self, traj: Any, task: Any, reward_type: str = "sparse") -> Any:
+        if reward_type == "dense":
+            raise NotImplementedError
+        return super().compute_reward(traj, task, reward_type)
+
+
 @breaks("sample_tasks draws from another source")
 class GlobalRandomness(LineFamily):
     def sample_tasks(self, n: Any, rng: Any) -> Any:
@@ -216,7 +244,7 @@ class NoDenseReward(LineFamily):
         return super().compute_reward(traj, task, reward_type)
 
 
-@breaks("compute_reward with reward_type='dense' must return finite float32")
+@breaks("compute_reward with reward_type='dense' returned a number that is not finite")
 class InfiniteDenseReward(LineFamily):
     def compute_reward(self, traj: Any, task: Any, reward_type: str = "sparse") -> Any:
         return super().compute_reward(traj, task, reward_type) + np.float32(np.inf if reward_type == "dense" else 0.0)

@@ -285,15 +285,23 @@ def test_a_task_that_changes_within_an_episode_and_an_episode_without_end() -> N
         add(1)
 
 
-def test_a_reward_hook_that_returns_nan_is_refused() -> None:
-    buffer = filled(relabel_probability=1.0)
+@pytest.mark.parametrize(
+    ("spoil", "sentence"),
+    [
+        (lambda rewards: rewards * np.nan, "for a hindsight task, returned NaN or infinity, expected finite rewards"),
+        (lambda rewards: rewards.sum(axis=-1), r"returned shape \(\d+,\), expected \(\d+, 1\): one for each step"),
+    ],
+)
+@pytest.mark.parametrize("reward_type", ["sparse", "dense"])
+def test_a_reward_hook_that_returns_no_rewards_is_refused(spoil: Any, sentence: str, reward_type: str) -> None:
+    buffer = filled(relabel_probability=1.0, rl_reward_type=reward_type)
 
     class Broken(PointRobotFamily):
-        def compute_reward(self, *args: Any, **kwargs: Any) -> Any:
-            return super().compute_reward(*args, **kwargs) * np.nan
+        def compute_reward(self, traj: Any, task: Any, reward_type: str = "sparse") -> Any:
+            return spoil(super().compute_reward(traj, task, reward_type))
 
     buffer.task_family = Broken()
-    with pytest.raises(ValueError, match="compute_reward returned NaN or infinity"):
+    with pytest.raises(ValueError, match=f"^compute_reward with reward_type='(sparse|dense)', .*{sentence}"):
         buffer.sample(4)
 
 
