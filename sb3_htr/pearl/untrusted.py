@@ -115,7 +115,10 @@ def check_is_ours(what: str, module: str) -> None:
     :raises Refused: if that is none of this package
     """
     if not module.startswith("sb3_htr."):
-        raise Refused(f"its {what} is a class of its own, which only PEARL.load restores, and that may run code of the file.")
+        raise Refused(
+            f"its {what} is a class of its own, which only PEARL.load restores (on the command line, --trust), and that may "
+            "run code of the file."
+        )
 
 
 def _plain(what: str, explorer: dict[str, Any]) -> dict[str, Any]:
@@ -148,7 +151,8 @@ def _policy_kwargs(given: dict[str, Any]) -> dict[str, Any]:
     unknown = [name for name in given if name not in (*known, "optimizer_kwargs") and not name.startswith(":")]
     if unknown:
         raise Refused(
-            f"its policy has the setting {unknown[0]!r}, which only PEARL.load restores, and that may run code of the file."
+            f"its policy has the setting {unknown[0]!r}, which only PEARL.load restores (on the command line, --trust), and "
+            "that may run code of the file."
         )
     kwargs = {name: value for name, value in given.items() if name in known and value is not None}
     n_critics = kwargs.get("n_critics", 2)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import gymnasium as gym
 
-from htr_envs.goal_env import find_hidden
+from htr_envs.goal_env import NAMESPACE, find_hidden
 from sb3_htr.common.resume import n_steps_done
 from sb3_htr.zoo.run.agents import OF_TRAINING, RECORD, find_run, is_finished, n_steps_of, read_record
 from sb3_htr.zoo.run.defaults import default_arguments, given_arguments, value_of
@@ -122,7 +122,8 @@ def main(argv: Sequence[str]) -> None:
         if isinstance(error, NameError) and traceback.extract_tb(error.__traceback__)[-1].filename != "<string>":
             raise
         raise ValueError(
-            f"{error}: the values of -params and --env-kwargs are Python, with strings in quotes, as in \"explorer:'prior'\"."
+            f"{error}: -params and --env-kwargs take name:value, where a value is Python, with strings in quotes, as in "
+            "\"explorer:'prior'\"."
         ) from error
 
 
@@ -140,9 +141,10 @@ def _from_anywhere(arguments: Sequence[str]) -> list[str]:
 def _check_id(env_id: str) -> None:
     if env_id in gym.registry:
         return
-    module, colon, name = env_id.rpartition(":")
+    hidden = f"{NAMESPACE}/" if env_id.startswith(f"{NAMESPACE}/") else ""
+    module, colon, name = env_id.removeprefix(hidden).rpartition(":")
     if colon:
-        raise ValueError(f"--env is {env_id!r}, with a module: give --gym-packages {module} --env {name}.")
+        raise ValueError(f"--env is {env_id!r}, with a module: give --gym-packages {module} --env {hidden}{name}.")
     nearest = difflib.get_close_matches(env_id, gym.registry, n=1)
     meant = f"did you mean {nearest[0]}? " if nearest else ""
     raise ValueError(f"There is no env {env_id}: {meant}{OWN_ENV}")

@@ -59,6 +59,14 @@ from sb3_htr.zoo.run.trust import PACKAGES, check_arguments, plain_settings, ref
 
 # What a YAML file may have beside the arguments of the algorithm
 ZOO_SETTINGS = ("n_envs", "n_timesteps", "env_wrapper", "vec_env_wrapper", "callback", "env_kwargs")
+# Arguments of an algorithm that rl_zoo3 gives it itself
+OPTIONS = {
+    "env": "--env",
+    "seed": "--seed",
+    "device": "--device",
+    "verbose": "--verbose",
+    "tensorboard_log": "--tensorboard-log",
+}
 
 
 class MetaExperimentManager(ExperimentManager):
@@ -121,6 +129,7 @@ class MetaExperimentManager(ExperimentManager):
         hyperparams = self.method.settings(hyperparams)
         if self.resumed is not None:  # what a user gave comes from a file now
             given = checked(given, self.resumed / RECORD)
+        checked_kinds(given, "-params" if self.resumed is None else self.resumed / RECORD)
         self._given = given
         hyperparams = merged(merged(hyperparams, checked(self._trial(trial_id), self.storage)), given)
         if self.n_timesteps > 0:
@@ -186,6 +195,8 @@ class MetaExperimentManager(ExperimentManager):
                 "normalize asks for SB3's VecNormalize, which is not saved with the model: leave it out, the policy "
                 "normalizes observations itself (normalize_observations of policy_kwargs)."
             )
+        if elsewhere := sorted(hyperparams.keys() & OPTIONS.keys()):
+            raise ValueError(f"{elsewhere[0]} is no hyperparameter: give it by {OPTIONS[elsewhere[0]]}.")
         model_class = self.method.algorithm.model_class()
         own = {*keywords_of(model_class), *ZOO_SETTINGS}
         within = {"replay_buffer_kwargs": MultiTaskReplayBuffer, "policy_kwargs": PEARLPolicy} if model_class is PEARL else {}
