@@ -126,6 +126,24 @@ def test_an_unknown_id_is_gymnasiums_business(tiny_pearl: MakePEARL) -> None:
         ({"policy_kwargs": {"optimizer_class": "Adam"}}, r"optimizer_class is 'Adam', expected a class derived from torch\."),
         ({"policy_kwargs": {"normalize_observations": "no"}}, "normalize_observations is 'no', expected True or False"),
         ({"policy_kwargs": {"use_sde": True}}, "policy_kwargs has no setting 'use_sde'"),
+        ({"policy_kwargs": {"lr_schedul": 1}}, "policy_kwargs has no setting 'lr_schedul': expected one of"),
+        ({"policy_kwargs": {"action_space": 1}}, "policy_kwargs has no setting 'action_space'"),
+        ({"policy_kwargs": [1]}, r"policy_kwargs is \[1\], expected names and values"),
+        ({"policy_kwargs": {"optimizer_kwargs": 3}}, "optimizer_kwargs is 3, expected names and values"),
+        *(
+            ({"policy_kwargs": {name: units}}, f"{name} is .*, expected the hidden units of each layer")
+            for name in ("net_arch", "encoder_arch")
+            for units in (64, [64.0], [0], [True], "64", {"pi": [64]})
+        ),
+        ({"policy_kwargs": {"net_arch": {"pi": [64], "qf": [64.0]}}}, r"qf is \[64\.0\], expected the hidden units"),
+        ({"replay_buffer_kwargs": 3}, "replay_buffer_kwargs is 3, expected names and values"),
+        ({"replay_buffer_class": "HerReplayBuffer"}, "replay_buffer_class is HerReplayBuffer, expected MultiTaskReplayBuffer"),
+        *(({"learning_rate": rate}, "learning_rate is .*, expected a number of at least 0") for rate in ("1e-3", None, -1)),
+        *(({"target_entropy": value}, "target_entropy is .*, expected a number, or 'auto'") for value in ("x", None)),
+        *(({"policy": policy}, "policy is .*, expected a class derived from sb3_htr") for policy in (None, 3)),
+        ({"verbose": "a"}, "verbose is 'a', expected a whole number"),
+        ({"stats_window_size": 0}, "stats_window_size is 0, expected a whole number of at least 1"),
+        ({"device": None}, "The device 'None' cannot be used: give cpu"),
         ({"ent_coef": -0.1}, "ent_coef is -0.1, expected a number of at least 0"),
         *(
             ({"ent_coef": text}, f"ent_coef is the text '{text}', expected a number")

@@ -366,7 +366,7 @@ def check_device(device: th.device | str) -> None:
     try:
         used = get_device(device)
         th.empty(0, device=used)
-    except (RuntimeError, AssertionError, NotImplementedError):
+    except (RuntimeError, AssertionError, NotImplementedError, TypeError):
         raise ValueError(f"The device {str(device)!r} cannot be used: give cpu, cuda or cuda:N.") from None
     if device != "auto" and th.device(device).type != used.type:
         warnings.warn(f"There is no {device} that torch could use: {used} is used.", stacklevel=3)

@@ -48,8 +48,10 @@ def box_in_words(record: Any) -> spaces.Box | None:
     :return: the space of these bounds; None where it is no box, or one too long to be printed in full
     """
     try:
-        low, high = (np.array(re.sub(r"[\[\]]", " ", record[name]).split(), np.float64) for name in ("low", "high"))
-        return spaces.Box(low.reshape(record["_shape"]), high.reshape(record["_shape"]), dtype=np.float64)
+        printed = (re.sub(r"[\[\]]", " ", record[name]).split() for name in ("low", "high"))
+        low, high = (np.array(numbers, np.float64).reshape(record["_shape"]) for numbers in printed)
+        # Rounded when they were printed, each array to digits of its own, they may cross
+        return spaces.Box(low, np.maximum(low, high), dtype=np.float64)
     except (KeyError, TypeError, ValueError, AssertionError):
         return None
 

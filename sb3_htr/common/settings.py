@@ -74,6 +74,29 @@ def check_flags(**flags: Any) -> None:
             raise ValueError(f"{name} is {value!r}, expected True or False.")
 
 
+def check_mappings(**mappings: Any) -> None:
+    """
+    :param mappings: name of a setting and its value
+    :raises ValueError: for the first one that is neither None nor names with values
+    """
+    for name, value in mappings.items():
+        if value is not None and not isinstance(value, Mapping):
+            raise ValueError(f"{name} is {value!r}, expected names and values, as in {{'name': value}}.")
+
+
+def check_layers(**networks: Any) -> None:
+    """
+    :param networks: name of a setting and its value
+    :raises ValueError: for the first one that is neither None nor a list of whole numbers
+    """
+    for name, units in networks.items():
+        if units is None:
+            continue
+        whole = isinstance(units, list | tuple) and all(type(plain(n)) is int and n >= 1 for n in units)
+        if not whole:
+            raise ValueError(f"{name} is {units!r}, expected the hidden units of each layer, as in [128, 128].")
+
+
 def check_class(name: str, value: Any, base: type) -> None:
     """
     :param name: of a setting

@@ -40,7 +40,7 @@ from sb3_htr.common.random_state import (
     stream,
 )
 from sb3_htr.common.saving import CheckedFiles, with_suffix
-from sb3_htr.common.settings import check_keywords, check_numbers, plain
+from sb3_htr.common.settings import check_class, check_keywords, check_mappings, check_numbers, plain
 from sb3_htr.common.training_state import Resumable
 from sb3_htr.common.vec_env import in_float32, make_task_vec_env, seed_envs
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
@@ -48,7 +48,8 @@ from sb3_htr.htr.reward_hook import check_reward_hook
 from sb3_htr.pearl.horizon import BY_HORIZON, STEPS_PER_UPDATE, complete, timesteps_for
 from sb3_htr.pearl.policies import PEARLPolicy
 
-# Arguments of the replay buffer that are the model's
+# Arguments of the policy, and of the replay buffer, that are the model's
+GIVEN_TO_POLICY = ("observation_space", "action_space", "lr_schedule")
 GIVEN_BY_MODEL = (
     "buffer_size",
     "observation_space",
@@ -109,7 +110,14 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         **kwargs: Any,
     ) -> None:
         checks.check_device(kwargs.get("device", "auto"))
-        check_numbers(n_tasks_per_rollout=(n_tasks_per_rollout, 1))
+        check_numbers(
+            n_tasks_per_rollout=(n_tasks_per_rollout, 1),
+            verbose=(kwargs.get("verbose", 0), 0),
+            stats_window_size=(kwargs.get("stats_window_size", 1), 1),
+        )
+        check_mappings(replay_buffer_kwargs=replay_buffer_kwargs, policy_kwargs=policy_kwargs)
+        if not isinstance(policy, str | type):  # of another class, CheckedFiles says so
+            check_class("policy", policy, PEARLPolicy)
         seed = checked_seed(seed)
         self.explorer, self.train_explorer = to_explorer(explorer), to_explorer(train_explorer)
         if isinstance(env, str):
@@ -118,8 +126,8 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
             env = self._wrap_env(env)
             checks.check_spaces(env)
         policy_class = self.policy_aliases.get(policy) if isinstance(policy, str) else policy
-        if policy_class is not None:  # else CheckedFiles says so
-            check_keywords("policy_kwargs", policy_kwargs or {}, policy_class)
+        if policy_class is not None:  # else it does so, too
+            check_keywords("policy_kwargs", policy_kwargs or {}, policy_class, without=GIVEN_TO_POLICY)
         super().__init__(
             policy=policy,
             env=env,  # type: ignore[arg-type]
@@ -176,10 +184,11 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         check_numbers(n_tasks_per_rollout=(self.n_tasks_per_rollout, 1))
         self.seed = checked_seed(self.seed)
         self.replay_buffer_class = buffer_class = self.replay_buffer_class or MultiTaskReplayBuffer
-        if not issubclass(buffer_class, MultiTaskReplayBuffer):
+        if not (isinstance(buffer_class, type) and issubclass(buffer_class, MultiTaskReplayBuffer)):
+            given = getattr(buffer_class, "__name__", buffer_class)
             raise ValueError(
-                f"replay_buffer_class is {buffer_class.__name__}, expected MultiTaskReplayBuffer, which relabels by itself, "
-                "or a subclass of it: leave it out."
+                f"replay_buffer_class is {given}, expected MultiTaskReplayBuffer, which relabels by itself, or a subclass of "
+                "it: leave it out."
             )
         check_keywords("replay_buffer_kwargs", self.replay_buffer_kwargs, buffer_class, without=GIVEN_BY_MODEL)
         if self.env is not None:

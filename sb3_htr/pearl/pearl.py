@@ -3,6 +3,7 @@
 import re
 from typing import Any, ClassVar
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
@@ -200,6 +201,10 @@ class PEARL(OffPolicyMetaAlgorithm):
         if self.final_kl_coef is not None and 0 in (self.kl_coef, self.final_kl_coef):
             raise ValueError("kl_coef and final_kl_coef are a factor apart, so neither may be 0: expected numbers above 0.")
         check_flags(cuda_graph=self.cuda_graph)
+        if not callable(self.learning_rate):
+            check_numbers(learning_rate=(self.learning_rate, 0.0))
+        if self.target_entropy != "auto" and not isinstance(self.target_entropy, float | int | np.number):
+            raise ValueError(f"target_entropy is {self.target_entropy!r}, expected a number, or 'auto'.")
         if self.matmul_precision not in PRECISIONS:
             raise ValueError(f"matmul_precision is {self.matmul_precision!r}, expected one of {list(PRECISIONS)}.")
         super()._setup_model()

@@ -16,7 +16,7 @@ from torch import nn
 from sb3_htr.common.latent_policy import LatentPolicy
 from sb3_htr.common.linear import Linear, Stack, with_fast_layers
 from sb3_htr.common.normalizer import ObservationNormalizer
-from sb3_htr.common.settings import check_class, check_flags, check_numbers
+from sb3_htr.common.settings import check_class, check_flags, check_layers, check_mappings, check_numbers
 from sb3_htr.common.type_aliases import Context
 from sb3_htr.pearl.encoder import ContextEncoder, to_encoder_class
 from sb3_htr.pearl.reward_model import RewardModel
@@ -69,7 +69,7 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
     :param observation_space: Box, without the task variable
     :param action_space: Box
     :param lr_schedule: learning rate
-    :param net_arch: hidden units of actor and critics (paper A.2: ``[300, 300, 300]``)
+    :param net_arch: hidden units of actor and critics (paper A.2: ``[300, 300, 300]``), or ``{"pi": ..., "qf": ...}``
     :param encoder_arch: hidden units of the context encoder (paper A.2: ``[200, 200, 200]``)
     :param encoder_class: what infers z, see :class:`ContextEncoder`; or the name of one of :mod:`sb3_htr.pearl.encoder`
     :param latent_dim: dimension of z (paper A.2: 5)
@@ -88,7 +88,7 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
         observation_space: spaces.Box,
         action_space: spaces.Box,
         lr_schedule: Schedule,
-        net_arch: list[int] | None = None,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
         encoder_arch: list[int] | None = None,
         encoder_class: type[ContextEncoder] | str = ContextEncoder,
         latent_dim: int = 5,
@@ -100,6 +100,10 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
     ) -> None:
         check_numbers(latent_dim=(latent_dim, 1), n_critics=(n_critics, 1))
         check_flags(normalize_observations=normalize_observations)
+        check_mappings(optimizer_kwargs=optimizer_kwargs)
+        # SB3 takes one for actor and critics each, too
+        parts = net_arch if isinstance(net_arch, dict) and net_arch.keys() == {"pi", "qf"} else {"net_arch": net_arch}
+        check_layers(**parts, encoder_arch=encoder_arch)
         check_class("activation_fn", activation_fn, nn.Module)
         check_class("optimizer_class", optimizer_class, th.optim.Optimizer)
         if optimizer_class is th.optim.Adam and not {"foreach", "differentiable"} & {*(optimizer_kwargs or ())}:
