@@ -103,6 +103,7 @@ def _check_family(family: TaskFamily) -> None:
         _check_task_array(tasks, family, name)
         _require(not tasks.flags.writeable, f"{name} can be written to: call its setflags(write=False).")
         keys = {tuple(task) for task in tasks.tolist()}
+        _require(len(keys) == len(tasks), f"{name} holds a task twice: the tasks of a set must differ.")
         _require(not keys & seen, f"{name} shares a task with another set: train must not meet validation or test.")
         seen |= keys
     drawn = [family.sample_tasks(5, np.random.default_rng(0)) for _ in range(2)]

@@ -45,6 +45,8 @@ class TaskDistribution(ABC):
                 raise ValueError(f"{name} holds a task that is not in {task_space}: widen the space or move it.")
             # adding 0.0 turns -0.0 into 0.0, the same task with other bytes
             keys = {(task + 0.0).tobytes() for task in tasks}
+            if len(keys) < len(tasks):
+                raise ValueError(f"{name} holds a task twice: the tasks of a set must differ.")
             if keys & seen:
                 raise ValueError(f"{name} shares a task with another set: train, validation and test tasks must be disjoint.")
             seen |= keys
