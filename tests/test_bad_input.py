@@ -17,6 +17,7 @@ from gymnasium.wrappers import FlattenObservation, FrameStackObservation, Rescal
 from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecMonitor, VecNormalize
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL, many
@@ -396,6 +397,24 @@ def test_an_unknown_id_on_the_command_line_says_how_one_is_found(env_id: str, me
 def test_a_settings_file_that_is_not_there() -> None:
     with pytest.raises(FileNotFoundError, match=r"There is no file pearl_pior\.yml: did you mean pearl_prior\.yml\?"):
         main(["train", "--env", ENV_ID, "-conf", "pearl_pior.yml"])
+
+
+def test_a_settings_file_that_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "speed.py").write_text("speed = 3")
+    for file, named in (("runs", "runs"), ("speed.py", r".*speed\.py")):
+        sentence = f"^{named} is no file of hyperparameters: expected ids of envs, with settings, in a dict named hyperparams"
+        with pytest.raises(ValueError, match=sentence):
+            main(["train", "--env", ENV_ID, "-conf", file])
+    with pytest.raises(FileNotFoundError, match=r"There is no file nothing\.py: expected a file of yours"):
+        main(["train", "--env", ENV_ID, "-conf", "nothing.py"])
+
+
+def test_a_callback_that_evaluates_in_the_envs_of_training_is_named(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    with pytest.raises(ValueError, match="a callback stepped the envs of training, as one that evaluates in them does"):
+        model.learn(4 * ROLLOUT, EvalCallback(model.env, eval_freq=7, n_eval_episodes=4, verbose=0))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("file", ["./door.py", "door.py"])

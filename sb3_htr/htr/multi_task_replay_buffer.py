@@ -232,7 +232,10 @@ class MultiTaskReplayBuffer(ReplayBuffer):
                 f"The task of env {i} changed from {self._open_task[i]} to {task[i]} within an episode: change tasks at reset."
             )
         if (step >= self.max_episode_steps).any():
-            raise ValueError(f"An episode is longer than the env's time limit of {self.max_episode_steps} steps.")
+            raise ValueError(
+                f"An episode is longer than the env's time limit of {self.max_episode_steps} steps: the env does not end it, "
+                "or a callback stepped the envs of training, as one that evaluates in them does; give it envs of its own."
+            )
         columns = self.transitions
         self._open[env, step, columns.observation] = np.reshape(obs, (self.n_envs, -1))
         self._open[env, step, columns.action] = np.reshape(action, (self.n_envs, -1))

@@ -131,7 +131,7 @@ def _from_anywhere(arguments: Sequence[str]) -> list[str]:
     """The same with whole paths, as a run may go on from another folder."""
     words = [part for word in arguments for part in (word.split("=", 1) if word.startswith(PATHS_EQUAL) else [word])]
     for i, (option, word) in enumerate(pairwise(words), start=1):
-        if option in ("-tb", "--tensorboard-log", *WEIGHTS) or (option in CONF and Path(word).exists()):
+        if option in ("-tb", "--tensorboard-log", *WEIGHTS) or (option in CONF and Path(word).is_file()):
             words[i] = str(Path(word).resolve())
         elif option == "--storage":
             words[i] = absolute(word)

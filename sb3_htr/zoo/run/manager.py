@@ -103,9 +103,10 @@ class MetaExperimentManager(ExperimentManager):
         with contextlib.redirect_stdout(StringIO()):  # it prints what is not all of it
             try:
                 hyperparams, _ = super().read_hyperparameters()
-            except (AttributeError, TypeError):
+            except (AttributeError, TypeError, KeyError):
+                named = "" if self.config.endswith((".yml", ".yaml")) else ", in a dict named hyperparams"
                 raise ValueError(
-                    f"{self.config} is no file of hyperparameters: expected ids of envs, with settings."
+                    f"{self.config} is no file of hyperparameters: expected ids of envs, with settings{named}."
                 ) from None
             except yaml.YAMLError as error:
                 raise ValueError(f"{self.config} cannot be read: {' '.join(str(error).split())}.") from None

@@ -27,13 +27,13 @@ def find_hyperparams(name: str) -> str:
     """
     :param name: of a file, as a user gives it
     :return: its path, one's own or, if there is none, that of the package's file of this name; a module stays as it is
-    :raises FileNotFoundError: if there is neither, of a YAML file
+    :raises FileNotFoundError: if there is neither, of a YAML or Python file
     """
     if Path(name).exists():
         return name
     if hyperparams_file(name).is_file():
         return str(hyperparams_file(name))
-    if Path(name).suffix in (".yml", ".yaml"):
+    if Path(name).suffix in (".yml", ".yaml", ".py"):
         theirs = sorted(path.name for path in shipped("hyperparams").glob("*.yml"))
         nearest = difflib.get_close_matches(Path(name).name, theirs, n=1)
         meant = f"did you mean {nearest[0]}?" if nearest else f"expected a file of yours, or one of {', '.join(theirs)}."
