@@ -126,7 +126,10 @@ def check_fits(env: GymEnv, observation_space: spaces.Space[Any], action_space: 
         boxes = isinstance(here, spaces.Box) and isinstance(there, spaces.Box)
         if not boxes or here.shape != there.shape or not _bounds_fit(here, there, name == "Observation"):
             if isinstance(here, spaces.Dict):
-                advice = "Of a GoalEnv, concatenate observation and achieved_goal, in this order, with a TransformObservation."
+                advice = (
+                    "Of a GoalEnv, take the env that htr_envs.hide_goal makes of it, which stays on a goal; or concatenate "
+                    "observation and achieved_goal, in this order, with a TransformObservation, and let resets keep the goal."
+                )
             else:
                 advice = "Wrap the env to have those of training (RescaleAction does it for actions), or train another model."
             raise ValueError(f"{name} spaces do not match: {here} here, {there} in training. {advice}")
