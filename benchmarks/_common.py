@@ -20,7 +20,7 @@ import htr_envs  # noqa: F401 registers the envs
 from sb3_htr import PEARL
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.vec_env import make_task_vec_env
-from sb3_htr.common.versions import commit, named, processor
+from sb3_htr.common.versions import commit, hardware, named
 from sb3_htr.zoo.run.malloc import keep_freed_memory
 
 # As sb3-htr train does
@@ -151,6 +151,5 @@ def machine() -> str:
     """
     :return: processor, threads and versions, and the GPU where one was used
     """
-    about = f"{processor()}, {os.cpu_count()} cores, Python {platform.python_version()}, torch {th.__version__}"
-    gpu = f", {th.cuda.get_device_name()}" if th.cuda.is_initialized() else ""
-    return f"{about}, {th.get_num_threads()} thread(s){gpu}"
+    about = f"{hardware()}, {os.cpu_count()} cores, Python {platform.python_version()}, torch {th.__version__}"
+    return f"{about}, {th.get_num_threads()} thread(s)"

@@ -74,7 +74,7 @@ def main() -> None:
     th.set_num_threads(1)
     ways: dict[str, dict[str, Any]] = {
         CORE: {"device": "cpu"},
-        OPERATIONS: {"device": device},
+        OPERATIONS: {"device": device, "cuda_graph": False},
         GRAPH: {"device": device, "cuda_graph": True},
     }
     measured: list[Figure] = []

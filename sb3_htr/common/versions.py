@@ -7,6 +7,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import torch as th
+
 PACKAGES = ("sb3_htr", "stable_baselines3", "sb3_contrib", "gymnasium", "rl_zoo3", "torch", "numpy", "mujoco")
 
 
@@ -31,6 +33,13 @@ def processor() -> str:
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.processor() or platform.machine()
+
+
+def hardware() -> str:
+    """
+    :return: the processor, and the GPU that this process has used, if any
+    """
+    return processor() + (f", {th.cuda.get_device_name()}" if th.cuda.is_initialized() else "")
 
 
 def commit(*paths: str) -> dict[str, str | bool]:

@@ -62,6 +62,7 @@ class Cell:
     :param env_kwargs: arguments of the env
     :param evaluations: what is done with the final model; one row of results for each
     :param gym_packages: modules that register what of this is not the package's own
+    :param device: torch device that it is trained on; its final model is evaluated on the CPU
     """
 
     experiment: str
@@ -77,6 +78,7 @@ class Cell:
     env_kwargs: KwArgs
     evaluations: tuple[Evaluation, ...]
     gym_packages: tuple[str, ...] = ()
+    device: str = "cpu"
 
     @property
     def name(self) -> str:
@@ -140,7 +142,7 @@ class Cell:
             for given in (self.settings, self.env_kwargs)
         )
         return [
-            *("--env", self.env_id, "--method", self.method),
+            *("--env", self.env_id, "--method", self.method, "--device", self.device),
             *("-f", str(folder), "--verbose", "0", "-n", str(self.n_timesteps)),
             *("--seed", str(self.seed), "--eval-freq", str(self.eval_freq), "--eval-episodes", str(self.n_episodes)),
             *(["-params", *settings] if settings else []),

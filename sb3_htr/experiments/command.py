@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from sb3_htr.common.checks import check_device
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.experiments import driver, executors, grid, raw_results, report
 from sb3_htr.experiments.cell import Cell
@@ -26,7 +27,8 @@ def main(argv: Sequence[str]) -> None:
     args = _parse(argv)
     how_many = (args.seeds or 1, 0.1) if args.quick else (args.seeds,)
     grids = {name: grid.EXPERIMENTS[name].cells(*how_many) for name in args.names}
-    grids = {name: [replace(cell, gym_packages=tuple(args.gym_packages)) for cell in cells] for name, cells in grids.items()}
+    given = {"gym_packages": tuple(args.gym_packages), "device": args.device}
+    grids = {name: [replace(cell, **given) for cell in cells] for name, cells in grids.items()}
     chosen = [cell for cells in grids.values() for cell in cells]
     if args.cell is not None:
         if not 0 <= args.cell < len(chosen):
@@ -48,7 +50,7 @@ def main(argv: Sequence[str]) -> None:
     if not args.finished:
         here = executors.Here() if args.cell is not None else executors.Processes(args.jobs)
         try:
-            driver.Driver(chosen, runs, executors.Ray(args.ray) if args.ray else here).run()
+            driver.Driver(chosen, runs, executors.Ray(args.ray, args.device) if args.ray else here).run()
         except KeyboardInterrupt:
             print(f"\nStopped. What ran goes on from its checkpoint in {runs} with the same command.", file=sys.stderr)
             raise SystemExit(130) from None
@@ -74,6 +76,7 @@ def _command(args: argparse.Namespace, cells: Sequence[Cell], output: Path) -> s
     """What repeats all runs of an experiment."""
     how = ("--quick " if args.quick else "") + f"--seeds {len({cell.seed for cell in cells})}"
     how += f" --gym-packages {' '.join(args.gym_packages)}" if args.gym_packages else ""
+    how += f" --device {args.device}" if args.device != "cpu" else ""
     # Those of its own folder are runs of the experiment, made by this command before
     others = [str(folder) for folder in args.with_results if folder.resolve() != output.resolve()]
     how += f" --with-results {' '.join(others)}" if others else ""
@@ -98,6 +101,8 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("-o", "--output", type=Path, help=output)
     earlier = "folders of results: runs that they have are finished, and not trained again"
     parser.add_argument("--with-results", type=Path, nargs="+", default=[], metavar="FOLDER", help=earlier)
+    device = "torch device to train on (default: cpu, whose bits are promised); final models are evaluated on the CPU"
+    parser.add_argument("--device", default="cpu", help=device)
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--jobs", type=int, default=2, help="runs at a time, each on one thread (default: 2)")
     where.add_argument("--ray", metavar="ADDRESS", help="run on a Ray cluster; auto for the one of this machine")
@@ -106,6 +111,8 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     args = parser.parse_args(argv)
     given = {"--seeds": args.seeds, "--jobs": args.jobs}
     check_numbers(**{name: (n, 1) for name, n in given.items() if n is not None})
+    if not args.ray:  # whose nodes may have others
+        check_device(args.device)
     if ":/" in str(args.runs):
         raise ValueError(f"--runs is {args.runs}, expected a folder: object stores have to be mounted.")
     if args.with_results and len(args.names) > 1:

@@ -15,7 +15,7 @@ from sb3_htr.adaptation.explorers import to_explorer
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.resume import checkpoints
-from sb3_htr.common.versions import commit, named, processor
+from sb3_htr.common.versions import commit, hardware, named
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.kept import FOLDER, Kept, digest_of_code
 from sb3_htr.experiments.log import logged
@@ -53,9 +53,9 @@ def lock_of(cell: Cell, runs: Path) -> SystemLock:
 
 def machine() -> str:
     """
-    :return: what seconds depend on
+    :return: what seconds depend on, after a training in this process
     """
-    return f"{processor()}, one thread per run, Python {platform.python_version()}"
+    return f"{hardware()}, one thread per run, Python {platform.python_version()}"
 
 
 def run_cell(cell: Cell, runs: Path) -> bool:

@@ -7,6 +7,7 @@ from typing import TypeAlias
 
 import torch as th
 
+from sb3_htr.common.errors import last_line
 from sb3_htr.common.packed import Packed, map_tensors, tensors_of
 from sb3_htr.common.type_aliases import MultiTaskSamples
 
@@ -76,7 +77,12 @@ class GraphedUpdate(FixedUpdate):
             return aside(partial(super()._run, update_target), self._device)
         if update_target not in self._replays:
             with capturable(self._optimizers):
-                self._replays[update_target] = capture(partial(self._record, update_target), self._device)
+                try:
+                    self._replays[update_target] = capture(partial(self._record, update_target), self._device)
+                except RuntimeError as error:
+                    raise RuntimeError(
+                        f"An update cannot be captured as a CUDA graph ({last_line(error)}): give cuda_graph=False."
+                    ) from error
         self._replays[update_target]()
         # The next replay overwrites it
         mean, names, log = self._outcomes[update_target]
@@ -120,6 +126,14 @@ def aside(function: Callable[[], Outcome], device: th.device) -> Outcome:
         result = function()
     th.cuda.current_stream(device).wait_stream(stream)
     return result
+
+
+def can_be_captured(optimizers: Sequence[th.optim.Optimizer]) -> bool:
+    """
+    :param optimizers: of what learns
+    :return: whether they are known to count no steps on the CPU, as Adam and AdamW
+    """
+    return all("capturable" in group for optimizer in optimizers for group in optimizer.param_groups)
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from sb3_htr.common.type_aliases import MultiTaskSamples, RewardLabels
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.pearl.divergence import PosteriorWatch, check_finite
 from sb3_htr.pearl.encoder import ContextEncoder, kl_to_prior
-from sb3_htr.pearl.graphed_update import FixedUpdate, GraphedUpdate, Outcome
+from sb3_htr.pearl.graphed_update import FixedUpdate, GraphedUpdate, Outcome, can_be_captured
 from sb3_htr.pearl.off_policy_meta_algorithm import OffPolicyMetaAlgorithm
 from sb3_htr.pearl.padding import padded
 from sb3_htr.pearl.policies import LatentCritic, MlpPolicy, PEARLPolicy
@@ -86,8 +86,8 @@ class PEARL(OffPolicyMetaAlgorithm):
     :param matmul_precision: of matrix products in updates, as for ``torch.set_float32_matmul_precision``. ``"medium"`` rounds
         their factors to bfloat16, which is faster where the processor has such products (docs/performance.md)
     :param cuda_graph: an update is one CUDA graph, for meta-batches that one task more, without a weight, fills up to as many
-        rows as there can be: six times as fast on a GPU (docs/performance.md). On a CPU they are filled up alike, nothing is
-        captured
+        rows as there can be: six times as fast on a GPU (docs/performance.md). By default on a GPU, where the optimizer can be
+        captured, as Adam can. True on a CPU fills them up alike, and captures nothing
     :param stats_window_size: episodes over which logged returns are averaged
     :param tensorboard_log: folder for TensorBoard, none by default
     :param policy_kwargs: arguments of the policy: ``latent_dim``, ``net_arch``, ``encoder_arch`` (paper: 5, 3x300, 3x200),
@@ -134,7 +134,7 @@ class PEARL(OffPolicyMetaAlgorithm):
         explorer: Explorer | dict[str, Any] | str = "belief",
         train_explorer: Explorer | dict[str, Any] | str = "aggregate",
         matmul_precision: str = "highest",
-        cuda_graph: bool = False,
+        cuda_graph: bool | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -200,7 +200,8 @@ class PEARL(OffPolicyMetaAlgorithm):
             raise ValueError("tau is 0, with which the target critics would never learn: expected a number above 0, up to 1.")
         if self.final_kl_coef is not None and 0 in (self.kl_coef, self.final_kl_coef):
             raise ValueError("kl_coef and final_kl_coef are a factor apart, so neither may be 0: expected numbers above 0.")
-        check_flags(cuda_graph=self.cuda_graph)
+        if self.cuda_graph is not None:
+            check_flags(cuda_graph=self.cuda_graph)
         if not callable(self.learning_rate):
             check_numbers(learning_rate=(self.learning_rate, 0.0))
         if self.target_entropy != "auto" and not isinstance(self.target_entropy, float | int | np.number):
@@ -227,9 +228,9 @@ class PEARL(OffPolicyMetaAlgorithm):
         if self.ent_coef_optimizer is not None:
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
-        fixed = self._fixed_update(optimizers) if self.cuda_graph else None
+        fixed = self._fixed_update(optimizers)
         # Meta-batches are filled up on the CPU, from where one copy brings all of it
-        self.replay_buffer.device = th.device("cpu") if self.cuda_graph else self.device
+        self.replay_buffer.device = self.device if fixed is None else th.device("cpu")
         with matmul_precision(self.matmul_precision):
             means, logs = zip(*(self._update(batch_size, fixed) for _ in range(gradient_steps)), strict=True)
         log_means = {key: th.stack([log[key] for log in logs]).mean().item() for key in logs[0]}
@@ -250,8 +251,11 @@ class PEARL(OffPolicyMetaAlgorithm):
             return self.kl_coef
         return float(self.kl_coef * (self.final_kl_coef / self.kl_coef) ** (1.0 - self._current_progress_remaining))
 
-    def _fixed_update(self, optimizers: list[th.optim.Optimizer]) -> FixedUpdate:
-        if self.device.type == "cuda":
+    def _fixed_update(self, optimizers: list[th.optim.Optimizer]) -> FixedUpdate | None:
+        on_gpu = self.device.type == "cuda"
+        if not (on_gpu and can_be_captured(optimizers) if self.cuda_graph is None else self.cuda_graph):
+            return None
+        if on_gpu:
             return GraphedUpdate(self._gradient_step, self.device, optimizers)
         return FixedUpdate(self._gradient_step, self.device)
 

@@ -33,7 +33,10 @@ SMALL: dict[str, Any] = {
 }
 
 
-def test_a_call_is_a_task_of_one_cpu_in_a_process_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("device", "n_gpus"), [("cpu", 0), ("cuda", 0.2)])
+def test_a_call_is_a_task_of_one_cpu_in_a_process_of_its_own(
+    device: str, n_gpus: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What is asked of Ray; it tries nothing again, because the driver does."""
     asked: list[Any] = []
 
@@ -55,9 +58,9 @@ def test_a_call_is_a_task_of_one_cpu_in_a_process_of_its_own(monkeypatch: pytest
 
     ray = SimpleNamespace(init=init, remote=remote, shutdown=lambda: asked.append("shutdown"))
     monkeypatch.setitem(sys.modules, "ray", ray)
-    with Ray("auto") as executor:
+    with Ray("auto", device) as executor:
         assert executor.submit(divmod, 7, 2).result() == (3, 1)
-    assert asked == ["auto", {"num_cpus": 1, "max_calls": 1, "max_retries": 0}, "shutdown"]
+    assert asked == ["auto", {"num_cpus": 1, "num_gpus": n_gpus, "max_calls": 1, "max_retries": 0}, "shutdown"]
     with pytest.raises(ConnectionError, match=r"No Ray cluster answers at 127.0.0.1:1 .*: start one with `ray start --head`"):
         Ray("127.0.0.1:1")
 

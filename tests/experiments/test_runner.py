@@ -389,6 +389,38 @@ def test_results_of_what_is_finished_are_written_without_training(
             main(["experiment", "pair", "--finished", *wrong])
 
 
+@pytest.mark.parametrize(("arguments", "device"), [([], "cpu"), (["--device", "cuda:0"], "cuda:0")])
+def test_runs_are_on_the_cpu_unless_a_device_is_given(
+    arguments: list[str], device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where there is a GPU, too: bits are promised on a CPU, and tables say on what their runs were trained."""
+    seen: list[Cell] = []
+
+    def run(cell: Cell, runs: Path) -> bool:
+        seen.append(cell)
+        cell.result(runs).parent.mkdir(parents=True)
+        made_up([cell], cell.result(runs).parent)
+        return True
+
+    only = Experiment("only", "", ENV_ID, 480, (Variant("htr-ser"),), 1, eval_freq=240, evaluations=by(("prior",)))
+    monkeypatch.setitem(grid.EXPERIMENTS, "only", only)
+    monkeypatch.setattr("sb3_htr.experiments.driver.run_cell", run)
+    monkeypatch.setattr("sb3_htr.experiments.command.executors.Processes", lambda n_jobs: Here())
+    monkeypatch.setattr("sb3_htr.experiments.command.check_device", lambda device: None)
+    monkeypatch.chdir(tmp_path)
+    assert main(["experiment", "only", *arguments]) == 0
+    (cell,) = seen
+    words = cell.training(tmp_path)
+    assert words[words.index("--device") + 1] == device
+    command = json.loads(Path("results", "only", "summary.json").read_text())["command"]
+    assert command == " ".join(["sb3-htr experiment only --seeds 1", *arguments])
+
+
+def test_a_device_that_there_is_not_is_refused() -> None:
+    with pytest.raises(ValueError, match="The device 'gpu' cannot be used: give cpu, cuda or cuda:N"):
+        main(["experiment", "point_robot", "--device", "gpu"])
+
+
 def test_runs_in_an_object_store_are_refused() -> None:
     """A local folder of that name would be on one node alone."""
     with pytest.raises(ValueError, match="expected a folder: object stores have to be mounted"):

@@ -13,7 +13,7 @@ import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
 
-from helpers import ROLLOUT, MakePEARL, parameters
+from helpers import ROLLOUT, MakePEARL, parameters, with_policy
 from helpers.recording import capture
 from sb3_htr import PEARL
 from sb3_htr.common.packed import Packed, tensors_of
@@ -158,6 +158,39 @@ def test_a_captured_update_draws_other_noise_each_time(tiny_pearl: MakePEARL, mo
     learn = graphed(model)
     losses = {model._update(5, learn)[1]["critic_loss"].item() for _ in range(20)}
     assert len(losses) == 20 and max(losses) < 2 * min(losses)
+
+
+@pytest.mark.parametrize(
+    ("device", "cuda_graph", "optimizer", "kind"),
+    [
+        ("cpu", None, "Adam", None),
+        ("cpu", True, "Adam", FixedUpdate),
+        ("cuda", None, "Adam", GraphedUpdate),
+        ("cuda", None, "AdamW", GraphedUpdate),
+        ("cuda", None, "Adagrad", None),
+        ("cuda", True, "Adagrad", GraphedUpdate),
+        ("cuda", False, "Adam", None),
+    ],
+)
+def test_on_a_gpu_updates_are_captured_unless_they_cannot_be(
+    device: str, cuda_graph: bool | None, optimizer: str, kind: Any, tiny_pearl: MakePEARL
+) -> None:
+    policy_kwargs = with_policy(optimizer_class=getattr(th.optim, optimizer))
+    model = tiny_pearl(cuda_graph=cuda_graph, ent_coef="auto", policy_kwargs=policy_kwargs)
+    model.device = th.device(device)  # which nothing is put on
+    fixed = model._fixed_update(optimizers_of(model))
+    assert type(fixed) is (type(None) if kind is None else kind)
+
+
+def test_what_cannot_be_captured_says_what_to_do(pair: tuple[PEARL, PEARL], monkeypatch: pytest.MonkeyPatch) -> None:
+    _, fixed = pair
+    refused = Mock(side_effect=RuntimeError("operation not permitted when stream is capturing"))
+    monkeypatch.setattr(graphed_update, "capture", refused)
+    monkeypatch.setattr(graphed_update, "aside", lambda function, device: function())
+    learn = graphed(fixed)
+    fixed._update(5, learn)
+    with pytest.raises(RuntimeError, match=r"CUDA graph \(operation not permitted .*\): give cuda_graph=False"):
+        fixed._update(5, learn)
 
 
 def test_what_a_recording_repeats_is_what_it_saw() -> None:

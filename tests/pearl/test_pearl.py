@@ -234,9 +234,9 @@ def test_logs(tiny_pearl: MakePEARL) -> None:
     assert np.isfinite([v for k, v in values.items() if k.startswith("train/")]).all()
 
 
-@pytest.mark.parametrize("cuda_graph", [False, True])
+@pytest.mark.parametrize("cuda_graph", [False, True, None])
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
-def test_the_same_seed_gives_the_same_bits(device: str, cuda_graph: bool, tiny_pearl: MakePEARL) -> None:
+def test_the_same_seed_gives_the_same_bits(device: str, cuda_graph: bool | None, tiny_pearl: MakePEARL) -> None:
     settings: dict[str, Any] = {"device": device, "cuda_graph": cuda_graph, "batch_size": 64}
     runs = [parameters(tiny_pearl(seed=3, **settings).learn(4 * ROLLOUT)) for _ in range(2)]
     other = parameters(tiny_pearl(seed=4, **settings).learn(4 * ROLLOUT))
