@@ -67,6 +67,7 @@ class Ray(Executor):
     :param address: of the cluster's head, or ``"auto"``
     :param device: torch device of the calls
     :raises ConnectionError: if no cluster answers there
+    :raises ValueError: if it has no GPU, and the device is one
     """
 
     def __init__(self, address: str, device: str = "cpu") -> None:
@@ -84,6 +85,10 @@ class Ray(Executor):
                 f"No Ray cluster answers at {address} ({error}): start one with `ray start --head`, or leave --ray out."
             ) from None
         n_gpus = 0 if device == "cpu" else GPU_SHARE
+        if n_gpus and not ray.cluster_resources().get("GPU"):
+            ray.shutdown()
+            # Ray would wait for one, without a word
+            raise ValueError(f"The Ray cluster at {address} has no GPU: start a node with one, or leave --device out.")
         self._call = ray.remote(num_cpus=1, num_gpus=n_gpus, max_calls=1, max_retries=0)(_call)
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:

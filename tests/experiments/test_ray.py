@@ -56,8 +56,15 @@ def test_a_call_is_a_task_of_one_cpu_in_a_process_of_its_own(
     def init(address: str, **_: Any) -> None:
         asked.append(address)
 
+    resources: dict[str, float] = {"CPU": 2.0}
     ray = SimpleNamespace(init=init, remote=remote, shutdown=lambda: asked.append("shutdown"))
+    ray.cluster_resources = lambda: resources
     monkeypatch.setitem(sys.modules, "ray", ray)
+    with pytest.raises(ValueError, match="The Ray cluster at auto has no GPU: start a node with one, or leave --device out"):
+        Ray("auto", "cuda")
+    assert asked == ["auto", "shutdown"]
+    asked.clear()
+    resources["GPU"] = 1.0
     with Ray("auto", device) as executor:
         assert executor.submit(divmod, 7, 2).result() == (3, 1)
     assert asked == ["auto", {"num_cpus": 1, "num_gpus": n_gpus, "max_calls": 1, "max_retries": 0}, "shutdown"]
