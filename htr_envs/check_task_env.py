@@ -247,7 +247,8 @@ def _check_pure(family: TaskFamily, traj: Trajectory) -> None:
         calls["compute_reward with reward_type='dense'"] = lambda: family.compute_reward(traj, other_task, "dense")
     first, second = ([_call(f"{name} fails on an episode.", call) for name, call in calls.items()] for _ in range(2))
     for name, result, again in zip(calls, first, second, strict=True):
-        _require(bool(np.isfinite(result).all()), f"{name} returned a number that is not finite.")
+        numbers = _call(f"{name} returned no numbers.", np.isfinite, result)
+        _require(bool(np.all(numbers)), f"{name} returned a number that is not finite.")
         _require(_same(result, again), f"{name} gives something else when it is called again: it must be pure.")
     unchanged = all(map(np.array_equal, before, traj))
     _require(unchanged, "A hook of the task family changes the trajectory that it is given: it must be pure.")
@@ -279,6 +280,7 @@ def _check_hindsight(family: TaskFamily, episode: Episode) -> FloatArray:
 def _check_sparse(family: TaskFamily, traj: Trajectory, own_tasks: FloatArray) -> None:
     tasks = np.concatenate((own_tasks, family.train_tasks))
     task_rewards = family.compute_reward(traj, tasks) - traj.task_free_reward
+    _require(bool(np.isfinite(task_rewards).all()), "compute_reward returned a number that is not finite for a training task.")
     failures = task_rewards[~family.is_success(traj, tasks)]
     advice = "is_success asks for too little, look at its threshold and units."
     _require(
@@ -326,6 +328,8 @@ def _check_episode(env: gym.Env[Any, Any], family: TaskFamily, seed: int) -> Non
     _check_vectorized("compute_reward", family.compute_reward, traj, tasks)
     if _has_dense(family, traj, tasks[0]):
         _check_vectorized("compute_reward with 'dense'", dense_reward, traj, tasks)
+        finite = bool(np.isfinite(dense_reward(traj, family.train_tasks)).all())
+        _require(finite, "compute_reward with reward_type='dense' is not finite for a training task.")
     _check_vectorized("is_success", family.is_success, traj, tasks)
     _check_sparse(family, traj, own_tasks)
 

@@ -126,15 +126,21 @@ def probe(source: GoalEnvSource) -> gym.Env[Any, Any]:
         )
     if not _is_flat(action_space) or not np.issubdtype(action_space.dtype, np.floating):
         raise ValueError(f"The action space of {source.spec.id} is {action_space}, expected a one-dimensional Box of floats.")
-    if not (isinstance(returned := env.reset(seed=0), tuple) and len(returned) == 2):
+    try:
+        returned = env.reset(seed=0)
+    except TypeError as error:
+        if "unexpected keyword argument" not in str(error):
+            raise
+        raise ValueError(_is_old(source)) from error
+    if not (isinstance(returned, tuple) and len(returned) == 2):
         raise ValueError(_is_old(source))
     return env
 
 
 def _is_old(source: GoalEnvSource) -> str:
     return (
-        f"{source.spec.id} has the interface of the old gym: reset must return observation and info, and step must return "
-        "observation, reward, terminated, truncated and info."
+        f"{source.spec.id} has the interface of the old gym: reset must take seed and options and return observation and "
+        "info, and step must return observation, reward, terminated, truncated and info."
     )
 
 

@@ -134,13 +134,21 @@ def test_an_unknown_id_is_gymnasiums_business(tiny_pearl: MakePEARL) -> None:
         *(
             ({"policy_kwargs": {name: units}}, f"{name} is .*, expected the hidden units of each layer")
             for name in ("net_arch", "encoder_arch")
-            for units in (64, [64.0], [0], [True], "64", {"pi": [64]})
+            for units in (64, [64.0], [0], [True], "64")
         ),
+        (
+            {"policy_kwargs": {"net_arch": {"pi": [64]}}},
+            "net_arch is .*, expected layers for 'pi' and 'qf', or a list for both",
+        ),
+        ({"policy_kwargs": {"net_arch": {"pi": None, "qf": [64]}}}, "pi is None, expected the hidden units of each layer"),
         ({"policy_kwargs": {"net_arch": {"pi": [64], "qf": [64.0]}}}, r"qf is \[64\.0\], expected the hidden units"),
         ({"replay_buffer_kwargs": 3}, "replay_buffer_kwargs is 3, expected names and values"),
         ({"replay_buffer_class": "HerReplayBuffer"}, "replay_buffer_class is HerReplayBuffer, expected MultiTaskReplayBuffer"),
         *(({"learning_rate": rate}, "learning_rate is .*, expected a number of at least 0") for rate in ("1e-3", None, -1)),
-        *(({"target_entropy": value}, "target_entropy is .*, expected a number, or 'auto'") for value in ("x", None)),
+        *(
+            ({"target_entropy": value}, "target_entropy is .*, expected a number, or 'auto'")
+            for value in ("x", None, np.nan, True)
+        ),
         *(({"policy": policy}, "policy is .*, expected a class derived from sb3_htr") for policy in (None, 3)),
         ({"verbose": "a"}, "verbose is 'a', expected a whole number"),
         ({"stats_window_size": 0}, "stats_window_size is 0, expected a whole number of at least 1"),
@@ -355,7 +363,7 @@ def test_a_window_without_a_screen_is_refused_with_what_to_do(monkeypatch: pytes
         (["--env", ENV_ID, "-params", "device:'cpu'"], "device is no hyperparameter: give it by --device"),
         (
             ["--env", ENV_ID, "-params", "learning_rate:'1e-3'"],
-            r"learning_rate is the text '1e-3' \(-params\), expected a number",
+            r"learning_rate is the text '1e-3' \(-params\), expected a number: leave the quotes out",
         ),
         (["--env", ENV_ID, "-params", "n_envs:0"], "n_envs is 0, expected a whole number of at least 1"),
         (["--env", ENV_ID, "-n", "0"], "n_timesteps is 0, expected a whole number of at least 1"),
@@ -1054,11 +1062,18 @@ def test_a_robot_that_returns_something_else(returned: Any, message: str, tiny_p
         tiny_pearl().adapt(robot)
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-def test_a_robot_of_the_old_gym(dim: int, tiny_pearl: MakePEARL) -> None:
+@pytest.mark.parametrize(
+    "reset",
+    [
+        lambda **_: np.zeros(2, dtype=np.float32),
+        lambda **_: np.zeros(3, dtype=np.float32),
+        lambda: np.zeros(2, dtype=np.float32),
+    ],
+)
+def test_a_robot_of_the_old_gym(reset: Any, tiny_pearl: MakePEARL) -> None:
     robot = Robot(20)
-    robot.reset = lambda **_: np.zeros(dim, dtype=np.float32)  # type: ignore[method-assign]
-    with pytest.raises(ValueError, match="an env's reset must return observation and info"):
+    robot.reset = reset  # type: ignore[method-assign]
+    with pytest.raises(ValueError, match="an env's reset must take seed and options, and return observation and info"):
         tiny_pearl().adapt(robot)
 
 

@@ -13,7 +13,7 @@ from sb3_htr.common.checks import get_max_episode_steps
 
 # An adaptation gives up after an episode of so many times those of training: an env that never ends one would hang
 ENDLESS = 10
-RESET_RETURNS = "an env's reset must return observation and info"
+RESET_RETURNS = "an env's reset must take seed and options, and return observation and info"
 # Functions of SB3's DummyVecEnv, and what an env returned that cannot be stored there
 NOT_STORED = {
     "reset": RESET_RETURNS,
@@ -115,8 +115,13 @@ def first_observations(env: VecEnv) -> np.ndarray:
     :return: (n_envs, obs_dim), after a reset
     :raises ValueError: if an env returns something else there than observation and info, as those of the old gym do
     """
-    with _returns_are_named():
-        obs = env.reset()
+    try:
+        with _returns_are_named():
+            obs = env.reset()
+    except TypeError as error:
+        if "unexpected keyword argument" not in str(error):
+            raise
+        raise ValueError(f"{error}: {RESET_RETURNS}") from error
     for info in env.unwrapped.reset_infos:
         # Of an observation of two numbers, the second
         if not isinstance(info, dict):

@@ -4,7 +4,7 @@ import hashlib
 import re
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -16,6 +16,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from sb3_htr.common.plain import box_in_words
 from sb3_htr.common.type_aliases import TaskFamily
 
 # Of gymnasium, with statistics of their own
@@ -111,7 +112,7 @@ def check_acts_in_floats(action_space: spaces.Space[Any]) -> None:
         )
 
 
-def check_fits(env: GymEnv, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+def check_fits(env: VecEnv, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
     """
     :param env: to adapt in; a robot need not say how its observations are bounded, and the spaces may have another dtype
     :param observation_space: of training
@@ -119,21 +120,40 @@ def check_fits(env: GymEnv, observation_space: spaces.Space[Any], action_space: 
     :raises ValueError: if observations have another shape than there, or other bounds where both have some; or actions another
         shape or other bounds
     """
-    for name, here, there in (
-        ("Observation", env.observation_space, observation_space),
-        ("Action", env.action_space, action_space),
-    ):
-        boxes = isinstance(here, spaces.Box) and isinstance(there, spaces.Box)
-        if not boxes or here.shape != there.shape or not _bounds_fit(here, there, name == "Observation"):
-            if isinstance(here, spaces.Dict):
-                advice = (
-                    "Of a GoalEnv, take the env that htr_envs.hide_goal makes of it, which stays on a goal; or concatenate "
-                    "observation and achieved_goal, in this order, with a TransformObservation, and let resets keep the goal."
-                )
-            else:
-                advice = "Wrap the env to have those of training (RescaleAction does it for actions), or train another model."
-            raise ValueError(f"{name} spaces do not match: {here} here, {there} in training. {advice}")
+    check_space_fits("Observation", env.observation_space, observation_space)
+    check_space_fits("Action", env.action_space, action_space)
     check_acts_in_floats(env.action_space)
+
+
+def check_space_fits(name: str, here: spaces.Space[Any], there: spaces.Space[Any]) -> None:
+    """
+    :param name: "Observation" or "Action"
+    :param here: space of an env
+    :param there: space of training
+    :raises ValueError: as :func:`check_fits`
+    """
+    boxes = isinstance(here, spaces.Box) and isinstance(there, spaces.Box)
+    if not boxes or here.shape != there.shape or not _bounds_fit(here, there, name == "Observation"):
+        if isinstance(here, spaces.Dict):
+            advice = (
+                "Of a GoalEnv, take the env that htr_envs.hide_goal makes of it, which stays on a goal; or concatenate "
+                "observation and achieved_goal, in this order, with a TransformObservation, and let resets keep the goal."
+            )
+        else:
+            advice = "Wrap the env to have those of training (RescaleAction does it for actions), or train another model."
+        raise ValueError(f"{name} spaces do not match: {here} here, {there} in training. {advice}")
+
+
+def check_recorded_spaces(where: Any, data: Mapping[str, Any]) -> None:
+    """
+    :param where: an env or a model, which has spaces
+    :param data: of a model file, as :func:`sb3_htr.common.plain.read_model` returns it; what it has in words is compared
+    :raises ValueError: if they do not fit
+    """
+    for name in ("observation", "action"):
+        here, there = getattr(where, f"{name}_space"), box_in_words(data.get(f"{name}_space"))
+        if there is not None and isinstance(here, spaces.Box):
+            check_space_fits(name.capitalize(), here, there)
 
 
 def _bounds_fit(here: Any, there: Any, may_be_unknown: bool) -> bool:

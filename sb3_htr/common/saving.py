@@ -2,16 +2,19 @@
 
 import io
 import pathlib
+import sys
 from collections.abc import Iterable
 from typing import Any, ClassVar, TypeVar
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.common.settings import check_keywords, keywords_of
+from sb3_htr.common.checks import check_device
+from sb3_htr.common.settings import check_keywords, check_mappings, keywords_of
 
 SelfCheckedFiles = TypeVar("SelfCheckedFiles", bound="CheckedFiles")
 
@@ -68,6 +71,8 @@ class CheckedFiles(BaseAlgorithm):
         :raises OSError: if there is no such file, or it is a folder
         """
         cls.check_names(kwargs, keywords_of(BaseAlgorithm.load))
+        check_mappings(**{name: value for name, value in kwargs.items() if name.endswith("_kwargs")})
+        check_device(kwargs.get("device", "auto"))
         if "stats_window_size" in kwargs:  # has another name in SB3's models
             kwargs["_stats_window_size"] = kwargs.pop("stats_window_size")
         if str(path).endswith(".pt"):
@@ -126,7 +131,9 @@ class CheckedFiles(BaseAlgorithm):
         :param exclude: attributes to leave out
         :param include: attributes to save that would be left out
         """
-        if isinstance(path, io.IOBase):
-            return super().save(path, exclude, include)
-        with atomic_path(with_suffix(path, ".zip")) as temporary:
-            super().save(temporary, exclude, include)
+        # Bounds of spaces in full, as who does not trust the file reads them
+        with np.printoptions(threshold=sys.maxsize, floatmode="unique", formatter=None):
+            if isinstance(path, io.IOBase):
+                return super().save(path, exclude, include)
+            with atomic_path(with_suffix(path, ".zip")) as temporary:
+                super().save(temporary, exclude, include)

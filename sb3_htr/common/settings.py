@@ -87,11 +87,9 @@ def check_mappings(**mappings: Any) -> None:
 def check_layers(**networks: Any) -> None:
     """
     :param networks: name of a setting and its value
-    :raises ValueError: for the first one that is neither None nor a list of whole numbers
+    :raises ValueError: for the first one that is no list of whole numbers
     """
     for name, units in networks.items():
-        if units is None:
-            continue
         whole = isinstance(units, list | tuple) and all(type(plain(n)) is int and n >= 1 for n in units)
         if not whole:
             raise ValueError(f"{name} is {units!r}, expected the hidden units of each layer, as in [128, 128].")

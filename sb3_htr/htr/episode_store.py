@@ -158,8 +158,8 @@ class EpisodeStore:
         if arrays["data"].shape[1:] != self._data.shape[1:] or arrays["slots"].shape[1] != self.episodes_per_task:
             raise ValueError(
                 f"The saved episodes have {arrays['slots'].shape[1]} slots a task of shape {arrays['data'].shape[1:]}, this "
-                f"buffer has {self.episodes_per_task} of {self._data.shape[1:]}: use the settings, and the time limit, "
-                "that they were saved with."
+                f"buffer has {self.episodes_per_task} of {self._data.shape[1:]}: "
+                "use the settings that they were saved with, and the same time limit."
             )
         if arrays["in_order"] != self.in_order:
             raise ValueError(

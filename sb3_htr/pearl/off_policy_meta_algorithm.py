@@ -110,9 +110,10 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         **kwargs: Any,
     ) -> None:
         checks.check_device(kwargs.get("device", "auto"))
+        verbose = kwargs.get("verbose", 0)
         check_numbers(
             n_tasks_per_rollout=(n_tasks_per_rollout, 1),
-            verbose=(kwargs.get("verbose", 0), 0),
+            verbose=(int(verbose) if isinstance(verbose, bool) else verbose, 0),
             stats_window_size=(kwargs.get("stats_window_size", 1), 1),
         )
         check_mappings(replay_buffer_kwargs=replay_buffer_kwargs, policy_kwargs=policy_kwargs)

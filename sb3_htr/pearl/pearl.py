@@ -1,9 +1,9 @@
 """PEARL: encoder, critics and actor, and how they learn."""
 
+import math
 import re
 from typing import Any, ClassVar
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
@@ -28,6 +28,13 @@ LEARNING_RATE = LinearSchedule(start=1e-3, end=0.0, end_fraction=1.0)
 LEARNT_ENT_COEF = r"auto(_(?=[^e]*[1-9])\d+(\.\d+)?(e-?\d)?)?"
 # Transitions of a meta-batch that the reward model learns from, each under all its tasks
 N_LABELLED = 256
+
+
+def _is_number(value: Any) -> bool:
+    try:
+        return not isinstance(value, bool) and math.isfinite(float(value))
+    except (TypeError, ValueError):
+        return False
 
 
 class PEARL(OffPolicyMetaAlgorithm):
@@ -86,8 +93,8 @@ class PEARL(OffPolicyMetaAlgorithm):
     :param matmul_precision: of matrix products in updates, as for ``torch.set_float32_matmul_precision``. ``"medium"`` rounds
         their factors to bfloat16, which is faster where the processor has such products (docs/performance.md)
     :param cuda_graph: an update is one CUDA graph, for meta-batches that one task more, without a weight, fills up to as many
-        rows as there can be: six times as fast on a GPU (docs/performance.md). By default on a GPU, where the optimizer can be
-        captured, as Adam can. True on a CPU fills them up alike, and captures nothing
+        rows as there can be: 5 to 6 times as fast on an H100 (docs/performance.md). By default on a GPU, where the optimizer
+        can be captured, as Adam can. True on a CPU fills them up alike, and captures nothing
     :param stats_window_size: episodes over which logged returns are averaged
     :param tensorboard_log: folder for TensorBoard, none by default
     :param policy_kwargs: arguments of the policy: ``latent_dim``, ``net_arch``, ``encoder_arch`` (paper: 5, 3x300, 3x200),
@@ -204,7 +211,7 @@ class PEARL(OffPolicyMetaAlgorithm):
             check_flags(cuda_graph=self.cuda_graph)
         if not callable(self.learning_rate):
             check_numbers(learning_rate=(self.learning_rate, 0.0))
-        if self.target_entropy != "auto" and not isinstance(self.target_entropy, float | int | np.number):
+        if self.target_entropy != "auto" and not _is_number(self.target_entropy):
             raise ValueError(f"target_entropy is {self.target_entropy!r}, expected a number, or 'auto'.")
         if self.matmul_precision not in PRECISIONS:
             raise ValueError(f"matmul_precision is {self.matmul_precision!r}, expected one of {list(PRECISIONS)}.")

@@ -102,8 +102,11 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
         check_flags(normalize_observations=normalize_observations)
         check_mappings(optimizer_kwargs=optimizer_kwargs)
         # SB3 takes one for actor and critics each, too
-        parts = net_arch if isinstance(net_arch, dict) and net_arch.keys() == {"pi", "qf"} else {"net_arch": net_arch}
-        check_layers(**parts, encoder_arch=encoder_arch)
+        parts = net_arch if isinstance(net_arch, dict) else {"net_arch": [128, 128] if net_arch is None else net_arch}
+        if isinstance(net_arch, dict) and not {"pi", "qf"} <= net_arch.keys():
+            raise ValueError(f"net_arch is {net_arch}, expected layers for 'pi' and 'qf', or a list for both.")
+        check_layers(**parts, encoder_arch=[] if encoder_arch is None else encoder_arch)
+        net_arch = {name: list(units) for name, units in parts.items()} if isinstance(net_arch, dict) else [*parts["net_arch"]]
         check_class("activation_fn", activation_fn, nn.Module)
         check_class("optimizer_class", optimizer_class, th.optim.Optimizer)
         if optimizer_class is th.optim.Adam and not {"foreach", "differentiable"} & {*(optimizer_kwargs or ())}:
@@ -119,7 +122,7 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
             spaces.Box(-np.inf, np.inf, (obs_dim + latent_dim,), np.float32),
             action_space,
             lr_schedule,
-            net_arch=[128, 128] if net_arch is None else net_arch,
+            net_arch=net_arch,
             activation_fn=activation_fn,
             n_critics=n_critics,
             optimizer_class=optimizer_class,

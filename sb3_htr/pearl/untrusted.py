@@ -11,9 +11,9 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_htr.adaptation import explorers
-from sb3_htr.common.checks import check_fits, check_spaces
+from sb3_htr.common.checks import check_recorded_spaces, check_spaces
 from sb3_htr.common.errors import OPEN_ERRORS, last_line
-from sb3_htr.common.plain import Refused, box_in_words, read_model
+from sb3_htr.common.plain import Refused, read_model
 from sb3_htr.common.saving import with_suffix
 from sb3_htr.common.settings import keywords_of
 from sb3_htr.common.vec_env import make_task_vec_env
@@ -93,7 +93,7 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
     for name in ("policy_kwargs", "replay_buffer_kwargs"):
         kwargs[name] = {**settings.pop(name), **(kwargs.get(name) or {})}
     _check_shapes(path, weights["policy"], env, kwargs["policy_kwargs"])
-    check_fits(env, *(box_in_words(data.get(name)) or getattr(env, name) for name in ("observation_space", "action_space")))
+    check_recorded_spaces(env, data)
     model = PEARL("MlpPolicy", env, device=device, _init_setup_model=False, **{**settings, **kwargs})
     # Which settings follow from: where the env has others, that is warned of
     vars(model).update({name: data[name] for name in ("max_episode_steps", "n_rollout_tasks") if type(data.get(name)) is int})

@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 
 import gymnasium as gym
 
+from sb3_htr.common.checks import check_recorded_spaces
 from sb3_htr.common.errors import OPEN_ERRORS, last_line
 from sb3_htr.common.plain import read_model
 from sb3_htr.rivals.base import Rival
@@ -35,7 +36,7 @@ def load_untrusted(
     :param device: torch device
     :return: a model to adapt and evaluate with
     :raises OSError: if there is no such file, or it cannot be opened
-    :raises ValueError: if it is no such file, or its weights do not fit the settings
+    :raises ValueError: if it is no such file, its weights do not fit the settings, or its spaces the env
     """
     try:
         data, weights = read_model(path, ["policy"])
@@ -52,6 +53,7 @@ def load_untrusted(
     except Exception as error:  # whatever a stranger can put into a file
         why = last_line(error) if isinstance(error, ValueError | RuntimeError) else ""
         raise ValueError(f"{path} is damaged, or no {model_class.__name__} with the settings of its record: {why}") from None
+    check_recorded_spaces(model, data)
     model.num_timesteps = n_steps
     return model
 

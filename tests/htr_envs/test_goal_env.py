@@ -167,6 +167,13 @@ class OldEnv(ReachEnv):
         return super().reset(**kwargs)[0]
 
 
+class UnseededOldEnv(ReachEnv):
+    """The same, without a seed."""
+
+    def reset(self) -> Any:  # type: ignore[override]
+        return super().reset()[0]
+
+
 class OldStepEnv(ReachEnv):
     """Steps as the old gym did."""
 
@@ -175,7 +182,7 @@ class OldStepEnv(ReachEnv):
         return observation, reward, terminated, info
 
 
-BAD = (CostlyEnv, InformedEnv, UnseededEnv, PlainEnv, DiscreteEnv, OldEnv, OldStepEnv)
+BAD = (CostlyEnv, InformedEnv, UnseededEnv, PlainEnv, DiscreteEnv, OldEnv, UnseededOldEnv, OldStepEnv)
 _class: Any
 for _class in (ReachEnv, ChoiceEnv, ListEnv, CutEnv, *BAD):
     gym.register(f"Toy{_class.__name__}-v0", entry_point=_class, max_episode_steps=30)
@@ -359,7 +366,8 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     ("ToyInformedEnv-v0", {}, "raised KeyError('reward') for goals of shape (n, goal_dim)"),
     ("ToyPlainEnv-v0", {}, "ToyPlainEnv-v0 is no GoalEnv"),
     ("ToyDiscreteEnv-v0", {}, "expected a one-dimensional Box"),
-    ("ToyOldEnv-v0", {}, "ToyOldEnv-v0 has the interface of the old gym: reset must return observation and info"),
+    ("ToyOldEnv-v0", {}, "ToyOldEnv-v0 has the interface of the old gym: reset must take seed and options"),
+    ("ToyUnseededOldEnv-v0", {}, "ToyUnseededOldEnv-v0 has the interface of the old gym"),
     ("ToyOldStepEnv-v0", {}, "ToyOldStepEnv-v0 has the interface of the old gym"),
     ("CartPole-v1", {}, "CartPole-v1 is no GoalEnv"),
 ]

@@ -104,6 +104,13 @@ def test_an_untrusted_model_is_refused_in_an_env_of_other_bounds(tiny_pearl: Mak
             load_untrusted(tmp_path / "model", other)
 
 
+def test_an_untrusted_model_is_loaded_in_its_env_however_numpy_printed(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    env = RescaleAction(gym.make(ENV_ID), np.float32(-np.pi), np.float32(np.pi))
+    with np.printoptions(precision=2, threshold=1, formatter={"float": lambda x: "?"}):
+        tiny_pearl(env, n_tasks_per_rollout=1).save(tmp_path / "model")
+    load_untrusted(tmp_path / "model", RescaleAction(gym.make(ENV_ID), np.float32(-np.pi), np.float32(np.pi)))
+
+
 @given(
     bounds=arrays(np.float32, (2, 6), elements=st.floats(-1e6, 1e6, width=32)).map(lambda a: np.sort(a, axis=0)),
     unbounded=st.booleans(),

@@ -20,9 +20,8 @@ def checked_kinds(hyperparams: dict[str, Any], file: object) -> dict[str, Any]:
         if name.endswith("kwargs") and not isinstance(value, dict | None) and not (is_text and name in MAY_BE_TEXT):
             raise ValueError(f"{name} is {value!r} ({file}), expected names and values.")
         if is_text and (name == "n_timesteps" or (name in SCHEDULES and not _is_linear(value))):
-            raise ValueError(
-                f"{name} is the text {value!r} ({file}), expected a number: in YAML, 1.0e-3 is one, and 1e-3 is not."
-            )
+            advice = "leave the quotes out" if file == "-params" else "in YAML, 1.0e-3 is one, and 1e-3 is not"
+            raise ValueError(f"{name} is the text {value!r} ({file}), expected a number: {advice}.")
     return {name: value for name, value in hyperparams.items() if value is not None or not name.endswith("kwargs")}
 
 

@@ -103,7 +103,9 @@ class MetaExperimentManager(ExperimentManager):
         with contextlib.redirect_stdout(StringIO()):  # it prints what is not all of it
             try:
                 hyperparams, _ = super().read_hyperparameters()
-            except (AttributeError, TypeError, KeyError):
+            except (AttributeError, TypeError, KeyError) as error:
+                if isinstance(error, KeyError) and error.args != ("hyperparams",):
+                    raise
                 named = "" if self.config.endswith((".yml", ".yaml")) else ", in a dict named hyperparams"
                 raise ValueError(
                     f"{self.config} is no file of hyperparameters: expected ids of envs, with settings{named}."

@@ -27,8 +27,11 @@ def find_hyperparams(name: str) -> str:
     """
     :param name: of a file, as a user gives it
     :return: its path, one's own or, if there is none, that of the package's file of this name; a module stays as it is
+    :raises ValueError: for a path of a folder
     :raises FileNotFoundError: if there is neither, of a YAML or Python file
     """
+    if Path(name).is_dir() and len(Path(name).parts) > 1:  # without a slash it may be a module
+        raise ValueError(f"{name} is a folder, expected a file of hyperparameters.")
     if Path(name).exists():
         return name
     if hyperparams_file(name).is_file():
