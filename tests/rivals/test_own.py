@@ -125,6 +125,9 @@ def test_an_off_policy_rival_sees_whole_episodes_and_goes_on_exactly(tmp_path: P
     loaded = load_untrusted(OwnTD3, tmp_path / "model.zip", record, gym.make(ENV_ID), "cpu")
     ours, theirs = (evaluate_adaptation(model, ENV_ID, n_episodes=1)[0] for model in (unbroken, loaded))
     np.testing.assert_array_equal(ours, theirs)
+    wider = gym.wrappers.RescaleAction(gym.make(ENV_ID), np.float32(-3), np.float32(3))
+    with pytest.raises(ValueError, match=r"^Action spaces do not match: Box\(-3\.0, 3\.0"):
+        load_untrusted(OwnTD3, tmp_path / "model.zip", record, wider, "cpu")
     with pytest.raises(ValueError, match="OwnTD3 has no setting 'train_freq': a rollout is an episode of each env"):
         own_td3(train_freq=1)
 
