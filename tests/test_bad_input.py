@@ -367,6 +367,7 @@ def test_a_window_without_a_screen_is_refused_with_what_to_do(monkeypatch: pytes
         ),
         (["--env", ENV_ID, "-params", "n_envs:0"], "n_envs is 0, expected a whole number of at least 1"),
         (["--env", ENV_ID, "-n", "0"], "n_timesteps is 0, expected a whole number of at least 1"),
+        (["--env", ENV_ID, "-params", "n_timesteps:0"], "n_timesteps is 0, expected a number of at least 1"),
         (["--env", ENV_ID, "-n", "-5"], "n_timesteps is -5"),
         (["--env", "CartPole-v1"], "The env has no task_family, so there are no tasks to meta-train on"),
         (["-n", "10"], "--env is missing"),

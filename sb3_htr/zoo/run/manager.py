@@ -142,6 +142,7 @@ class MetaExperimentManager(ExperimentManager):
                 f"{self.config} has no {' and no '.join(missing)} for {self.env_name}: add it, as pearl.yml has it."
             )
         hyperparams = checked_kinds(hyperparams, self.config)
+        check_numbers(n_timesteps=(hyperparams["n_timesteps"], 1.0))
         saved = OrderedDict(sorted(hyperparams.items()))
         print(f"Method {self.method.name}: {self.config} has the settings of the env. With those of the command line:")
         pprint(dict(saved))
