@@ -13,7 +13,6 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.common.checks import check_device
 from sb3_htr.common.settings import check_keywords, check_mappings, keywords_of
 
 SelfCheckedFiles = TypeVar("SelfCheckedFiles", bound="CheckedFiles")
@@ -72,7 +71,6 @@ class CheckedFiles(BaseAlgorithm):
         """
         cls.check_names(kwargs, keywords_of(BaseAlgorithm.load))
         check_mappings(**{name: value for name, value in kwargs.items() if name.endswith("_kwargs")})
-        check_device(kwargs.get("device", "auto"))
         if "stats_window_size" in kwargs:  # has another name in SB3's models
             kwargs["_stats_window_size"] = kwargs.pop("stats_window_size")
         if str(path).endswith(".pt"):

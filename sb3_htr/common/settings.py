@@ -9,6 +9,8 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 Kind = TypeVar("Kind")
+# Of a number that may be as small as it likes
+LOWEST = -sys.float_info.max
 VARIADIC = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
 
 
@@ -48,8 +50,8 @@ def check_numbers(**numbers: tuple[Any, float] | tuple[Any, float, float]) -> No
         # written so that nan, which compares with nothing, is refused too
         if isinstance(value, bool) or not (isinstance(value, kind) and low <= value <= high):
             article = "a whole number" if whole else "a number"
-            limits = f"of at least {low:g}" if high >= sys.float_info.max else f"from {low:g} to {high:g}"
-            raise ValueError(f"{name} is {value!r}, expected {article} {limits}.")
+            limits = f" of at least {low:g}" if high >= sys.float_info.max else f" from {low:g} to {high:g}"
+            raise ValueError(f"{name} is {value!r}, expected {article}{'' if low == LOWEST else limits}.")
 
 
 def plain(value: Any) -> Any:

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
 T = TypeVar("T")
-# Of a GPU, for a run: five side by side take about half the time that they would one after the other, docs/performance.md
+# Of a GPU, for a run: five were trained side by side on one, docs/performance.md
 GPU_SHARE = 0.2
 
 

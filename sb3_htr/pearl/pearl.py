@@ -1,6 +1,5 @@
 """PEARL: encoder, critics and actor, and how they learn."""
 
-import math
 import re
 from typing import Any, ClassVar
 
@@ -12,7 +11,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from sb3_htr.adaptation.explorers import Explorer
 from sb3_htr.common.matmul import PRECISIONS, matmul_precision
 from sb3_htr.common.segments import spread
-from sb3_htr.common.settings import check_flags, check_numbers
+from sb3_htr.common.settings import LOWEST, check_flags, check_numbers
 from sb3_htr.common.type_aliases import MultiTaskSamples, RewardLabels
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.pearl.divergence import PosteriorWatch, check_finite
@@ -28,13 +27,6 @@ LEARNING_RATE = LinearSchedule(start=1e-3, end=0.0, end_fraction=1.0)
 LEARNT_ENT_COEF = r"auto(_(?=[^e]*[1-9])\d+(\.\d+)?(e-?\d)?)?"
 # Transitions of a meta-batch that the reward model learns from, each under all its tasks
 N_LABELLED = 256
-
-
-def _is_number(value: Any) -> bool:
-    try:
-        return not isinstance(value, bool) and math.isfinite(float(value))
-    except (TypeError, ValueError):
-        return False
 
 
 class PEARL(OffPolicyMetaAlgorithm):
@@ -211,8 +203,8 @@ class PEARL(OffPolicyMetaAlgorithm):
             check_flags(cuda_graph=self.cuda_graph)
         if not callable(self.learning_rate):
             check_numbers(learning_rate=(self.learning_rate, 0.0))
-        if self.target_entropy != "auto" and not _is_number(self.target_entropy):
-            raise ValueError(f"target_entropy is {self.target_entropy!r}, expected a number, or 'auto'.")
+        if not (isinstance(self.target_entropy, str) and self.target_entropy == "auto"):
+            check_numbers(target_entropy=(self.target_entropy, LOWEST))
         if self.matmul_precision not in PRECISIONS:
             raise ValueError(f"matmul_precision is {self.matmul_precision!r}, expected one of {list(PRECISIONS)}.")
         super()._setup_model()
@@ -260,7 +252,8 @@ class PEARL(OffPolicyMetaAlgorithm):
 
     def _fixed_update(self, optimizers: list[th.optim.Optimizer]) -> FixedUpdate | None:
         on_gpu = self.device.type == "cuda"
-        if not (on_gpu and can_be_captured(optimizers) if self.cuda_graph is None else self.cuda_graph):
+        is_fixed = on_gpu and can_be_captured(optimizers) if self.cuda_graph is None else self.cuda_graph
+        if not is_fixed:
             return None
         if on_gpu:
             return GraphedUpdate(self._gradient_step, self.device, optimizers)

@@ -62,6 +62,17 @@ class LatentCritic(BaseModel):
         return th.cat([network(x).T for network in self.networks])
 
 
+def _checked_arch(net_arch: Any) -> list[int] | dict[str, list[int]]:
+    """For both actor and critics, or for each; SB3 takes lists alone."""
+    if not isinstance(net_arch, dict):
+        check_layers(net_arch=net_arch)
+        return [*net_arch]
+    if not {"pi", "qf"} <= net_arch.keys():
+        raise ValueError(f"net_arch is {net_arch}, expected layers for 'pi' and 'qf', or a list for both.")
+    check_layers(**net_arch)
+    return {name: [*units] for name, units in net_arch.items()}
+
+
 class PEARLPolicy(LatentPolicy, SACPolicy):
     """
     Actor, critics and context encoder of PEARL, and a model of rewards.
@@ -101,18 +112,14 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
         check_numbers(latent_dim=(latent_dim, 1), n_critics=(n_critics, 1))
         check_flags(normalize_observations=normalize_observations)
         check_mappings(optimizer_kwargs=optimizer_kwargs)
-        # SB3 takes one for actor and critics each, too
-        parts = net_arch if isinstance(net_arch, dict) else {"net_arch": [128, 128] if net_arch is None else net_arch}
-        if isinstance(net_arch, dict) and not {"pi", "qf"} <= net_arch.keys():
-            raise ValueError(f"net_arch is {net_arch}, expected layers for 'pi' and 'qf', or a list for both.")
-        check_layers(**parts, encoder_arch=[] if encoder_arch is None else encoder_arch)
-        net_arch = {name: list(units) for name, units in parts.items()} if isinstance(net_arch, dict) else [*parts["net_arch"]]
+        encoder_arch = [128, 128] if encoder_arch is None else encoder_arch
+        check_layers(encoder_arch=encoder_arch)
         check_class("activation_fn", activation_fn, nn.Module)
         check_class("optimizer_class", optimizer_class, th.optim.Optimizer)
         if optimizer_class is th.optim.Adam and not {"foreach", "differentiable"} & {*(optimizer_kwargs or ())}:
             optimizer_kwargs = {"fused": True, **(optimizer_kwargs or {})}
         self.latent_dim = latent_dim
-        self.encoder_arch = [128, 128] if encoder_arch is None else encoder_arch
+        self.encoder_arch = encoder_arch
         self.encoder_class = to_encoder_class(encoder_class)
         self.normalize_observations = normalize_observations
         obs_dim, action_dim = (int(np.prod(space.shape)) for space in (observation_space, action_space))
@@ -122,7 +129,7 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
             spaces.Box(-np.inf, np.inf, (obs_dim + latent_dim,), np.float32),
             action_space,
             lr_schedule,
-            net_arch=net_arch,
+            net_arch=_checked_arch([128, 128] if net_arch is None else net_arch),
             activation_fn=activation_fn,
             n_critics=n_critics,
             optimizer_class=optimizer_class,

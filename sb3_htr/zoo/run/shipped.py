@@ -30,7 +30,7 @@ def find_hyperparams(name: str) -> str:
     :raises ValueError: for a path of a folder
     :raises FileNotFoundError: if there is neither, of a YAML or Python file
     """
-    if Path(name).is_dir() and len(Path(name).parts) > 1:  # without a slash it may be a module
+    if Path(name).is_dir() and Path(name).name != name:  # without a slash it may be a module
         raise ValueError(f"{name} is a folder, expected a file of hyperparameters.")
     if Path(name).exists():
         return name
