@@ -129,7 +129,7 @@ def probe(source: GoalEnvSource) -> gym.Env[Any, Any]:
     try:
         returned = env.reset(seed=0)
     except TypeError as error:
-        if "unexpected keyword argument" not in str(error):
+        if "unexpected keyword argument 'seed'" not in str(error):
             raise
         raise ValueError(_is_old(source)) from error
     if not (isinstance(returned, tuple) and len(returned) == 2):

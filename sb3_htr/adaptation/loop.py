@@ -119,7 +119,7 @@ def first_observations(env: VecEnv) -> np.ndarray:
         with _returns_are_named():
             obs = env.reset()
     except TypeError as error:
-        if "unexpected keyword argument" not in str(error):
+        if "unexpected keyword argument 'seed'" not in str(error):
             raise
         raise ValueError(f"{error}: {RESET_RETURNS}") from error
     for info in env.unwrapped.reset_infos:
