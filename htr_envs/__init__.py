@@ -5,6 +5,7 @@ from gymnasium.envs.registration import register
 from htr_envs.check_task_env import check_task_env
 from htr_envs.dynamics import Dynamics, DynamicsEnv, DynamicsVectorEnv
 from htr_envs.goal_env import HiddenGoalEnv, HiddenGoalFamily, hide_goal
+from htr_envs.hidden_goal_wrapper import HiddenGoalWrapper
 from htr_envs.meta_env import MetaEnv, TaskDistribution
 from htr_envs.point_robot import PointRobotEnv, PointRobotFamily, PointRobotVectorEnv
 from htr_envs.position_goals import PositionGoalFamily
@@ -20,6 +21,7 @@ __all__ = [
     "DynamicsVectorEnv",
     "HiddenGoalEnv",
     "HiddenGoalFamily",
+    "HiddenGoalWrapper",
     "LocomotionFamily",
     "MetaEnv",
     "PointRobotEnv",

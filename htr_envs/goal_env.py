@@ -11,7 +11,15 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec, register
 from numpy.typing import ArrayLike, NDArray
 
-from htr_envs.goal_env_source import GoalEnvSource, draw_goal, draw_goal_sets, goal_rewards, probe
+from htr_envs.goal_env_source import (
+    GoalEnvSource,
+    draw_goal,
+    draw_goal_sets,
+    goal_rewards,
+    probe,
+    space_without_goal,
+    without_goal,
+)
 from htr_envs.headless import open_no_window
 from htr_envs.task_env import BoolArray, FloatArray, TaskEnv, TaskFamily, Trajectory, at_step, check_reward_type
 
@@ -117,8 +125,8 @@ class HiddenGoalEnv(TaskEnv):
     ## Rewards
 
     - `reward_type="sparse"`: `1` where the GoalEnv's own `compute_reward` says that the goal is reached, else `0`. Both kinds
-      of sparse rewards, -1 and 0 or 0 and 1, become this one. An agent that was trained so and adapts to the GoalEnv itself,
-      or a robot, must be given 1 and 0 as well: add 1 where that pays 0 and -1.
+      of sparse rewards, -1 and 0 or 0 and 1, become this one. An agent that was trained so and adapts to a robot must be given
+      1 and 0 as well, as `HiddenGoalWrapper` does.
     - `reward_type="dense"`: the reward of the GoalEnv with its own argument `reward_type="dense"`; minus the distance between
       achieved and desired goal where it has no such argument.
 
@@ -178,10 +186,8 @@ class HiddenGoalEnv(TaskEnv):
     ) -> None:
         super().__init__(HiddenGoalFamily(env_id, env_kwargs, **task_sets), reward_type)
         env = probe(self.task_family.source)
-        assert isinstance(env.observation_space, spaces.Dict) and isinstance(env.action_space, spaces.Box)
-        # whatever bounds the env gives: not all keep them, and rounded to float32 they are others
-        first = self._observe(env.observation_space.sample())
-        self.observation_space = spaces.Box(-np.inf, np.inf, first.shape, np.float32)
+        assert isinstance(env.action_space, spaces.Box)
+        self.observation_space = space_without_goal(env)
         low, high = (bound.astype(np.float32) for bound in (env.action_space.low, env.action_space.high))
         self.action_space = spaces.Box(low, high, dtype=np.float32)
         modes = [mode for mode in self.metadata["render_modes"] if mode in env.metadata.get("render_modes", ())]
@@ -205,7 +211,7 @@ class HiddenGoalEnv(TaskEnv):
         if self._env is None:
             self._env = self.task_family.source.make()
         observation, _ = self._env.reset(seed=self._seed)
-        return self._observe(observation)
+        return without_goal(observation)
 
     def _step_state(self, action: FloatArray) -> tuple[FloatArray, float, bool]:
         if self._env is None:
@@ -214,7 +220,7 @@ class HiddenGoalEnv(TaskEnv):
         self._actions.append(np.clip(action, self.action_space.low, self.action_space.high))
         observation, _, terminated, self._truncated, _ = self._env.step(self._actions[-1].copy())
         own_end = terminated and self.task_family.reached(observation["achieved_goal"], observation["desired_goal"])
-        return self._observe(observation), 0.0, bool(terminated and not own_end)
+        return without_goal(observation), 0.0, bool(terminated and not own_end)
 
     def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
         """Do one step; the time limit is left to the TimeLimit wrapper.
@@ -231,10 +237,6 @@ class HiddenGoalEnv(TaskEnv):
             env.reset(seed=self._seed)
         for action in self._actions[max(n_steps, 0) :]:
             env.step(action.copy())
-
-    @staticmethod
-    def _observe(observation: dict[str, NDArray[Any]]) -> FloatArray:
-        return np.concatenate((observation["observation"], observation["achieved_goal"]), dtype=np.float32)
 
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the GoalEnv with the hidden goal in the place of its own, where it keeps that in an attribute ``goal``.

@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 from gymnasium.error import DependencyNotInstalled, UnregisteredEnv
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from htr_envs.task_env import FloatArray
 
@@ -26,6 +26,10 @@ GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 # How far from one goal to the next rewards are looked at, to tell a sparse reward from one that grows on the way
 WAY = (0.001, 0.01, 0.1, 0.5, 1.0)
 N_STEPS = 20  # whose rewards are compared with compute_reward
+SPARSE_ONLY = (
+    "but a sparse reward is -1 and 0, or 0 and 1, the larger one at the goal: choose it by an argument of the env, such as "
+    "reward_type='sparse'."
+)
 MAX_DRAWS = 100  # for each task, where an env draws the same goals again and again
 
 
@@ -117,13 +121,8 @@ def probe(source: GoalEnvSource) -> gym.Env[Any, Any]:
     :raises ValueError: if it is no GoalEnv, or one of the old gym.
     """
     env = source.make()
-    space, action_space = env.observation_space, env.action_space
-    boxes = [space.spaces.get(key) for key in GOAL_KEYS] if isinstance(space, spaces.Dict) else [None]
-    if not all(map(_is_flat, boxes)) or not env.has_wrapper_attr("compute_reward"):
-        raise ValueError(
-            f"{source.spec.id} is no GoalEnv: its observations must be a Dict of one-dimensional boxes observation, "
-            "achieved_goal and desired_goal, and it must have compute_reward(achieved_goal, desired_goal, info)."
-        )
+    check_goal_env(env, source.spec.id)
+    action_space = env.action_space
     if not _is_flat(action_space) or not np.issubdtype(action_space.dtype, np.floating):
         raise ValueError(f"The action space of {source.spec.id} is {action_space}, expected a one-dimensional Box of floats.")
     try:
@@ -135,6 +134,40 @@ def probe(source: GoalEnvSource) -> gym.Env[Any, Any]:
     if not (isinstance(returned, tuple) and len(returned) == 2):
         raise ValueError(_is_old(source))
     return env
+
+
+def check_goal_env(env: gym.Env[Any, Any], name: str) -> None:
+    """Check that an env has the interface of a GoalEnv.
+
+    :param env: the env.
+    :param name: of it, for the sentence.
+    :raises ValueError: if it has not.
+    """
+    space = env.observation_space
+    boxes = [space.spaces.get(key) for key in GOAL_KEYS] if isinstance(space, spaces.Dict) else [None]
+    if not all(map(_is_flat, boxes)) or not env.has_wrapper_attr("compute_reward"):
+        raise ValueError(
+            f"{name} is no GoalEnv: its observations must be a Dict of one-dimensional boxes observation, "
+            "achieved_goal and desired_goal, and it must have compute_reward(achieved_goal, desired_goal, info)."
+        )
+
+
+def without_goal(observation: dict[str, NDArray[Any]]) -> FloatArray:
+    """What is left of an observation when its goal is hidden.
+
+    :param observation: of a GoalEnv.
+    :return: ``observation``, then ``achieved_goal``, shape (obs_dim,), float32.
+    """
+    return np.concatenate((observation["observation"], observation["achieved_goal"]), dtype=np.float32)
+
+
+def space_without_goal(env: gym.Env[Any, Any]) -> spaces.Box:
+    """The space of :func:`without_goal`: no bounds, as not all envs keep theirs, and rounded to float32 they are others.
+
+    :param env: a GoalEnv.
+    :return: the space, shape (obs_dim,).
+    """
+    return spaces.Box(-np.inf, np.inf, without_goal(env.observation_space.sample()).shape, np.float32)
 
 
 def _is_old(source: GoalEnvSource) -> str:
@@ -252,10 +285,7 @@ def _failure_reward(source: GoalEnvSource, goals: FloatArray) -> float:
     success = np.unique(goal_rewards(source, goals, goals))
     if len(success) != 1 or not np.array_equal(np.union1d(found, success), success[0] - np.array([1.0, 0.0])):
         shown = ", ".join(f"{value:.3g}" for value in np.union1d(found, success)[:5])
-        raise ValueError(
-            f"compute_reward of {source.spec.id} gives {shown} ..., but a sparse reward is -1 and 0, or 0 and 1, the larger "
-            "one at the goal: choose it by an argument of the env, such as reward_type='sparse'."
-        )
+        raise ValueError(f"compute_reward of {source.spec.id} gives {shown} ..., {SPARSE_ONLY}")
     _check_steps(source)
     return float(success[0]) - 1.0
 
@@ -263,7 +293,7 @@ def _failure_reward(source: GoalEnvSource, goals: FloatArray) -> float:
 def _check_steps(source: GoalEnvSource) -> None:
     env = probe(source)
     env.action_space.seed(0)
-    env.reset(seed=0)
+    goal = env.reset(seed=0)[0]["desired_goal"].copy()
     for _ in range(N_STEPS):
         if len(returned := env.step(env.action_space.sample())) != 5:
             raise ValueError(_is_old(source))
@@ -274,5 +304,9 @@ def _check_steps(source: GoalEnvSource) -> None:
                 f"A step of {source.spec.id} gave the reward {float(reward):.3g}, but compute_reward gives {expected:.3g} "
                 "without infos: a reward must depend on achieved and desired goal alone."
             )
+        if not np.array_equal(observation["desired_goal"], goal):
+            raise ValueError(
+                f"{source.spec.id} has a goal that moves within an episode, but a task stays: let resets alone draw it."
+            )
         if terminated or truncated:
-            env.reset()
+            goal = env.reset()[0]["desired_goal"].copy()

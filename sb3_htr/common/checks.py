@@ -136,8 +136,8 @@ def check_space_fits(name: str, here: spaces.Space[Any], there: spaces.Space[Any
     if not boxes or here.shape != there.shape or not _bounds_fit(here, there, name == "Observation"):
         if isinstance(here, spaces.Dict):
             advice = (
-                "Of a GoalEnv, take the env that htr_envs.hide_goal makes of it, which stays on a goal; or concatenate "
-                "observation and achieved_goal, in this order, with a TransformObservation, and let resets keep the goal."
+                "Of a GoalEnv, take the env that htr_envs.hide_goal makes of it, which stays on a goal; put a robot's own "
+                "into htr_envs.HiddenGoalWrapper."
             )
         else:
             advice = "Wrap the env to have those of training (RescaleAction does it for actions), or train another model."

@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.error import DependencyNotInstalled
+from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from helpers.drawing import skip_where_mujoco_cannot_draw
-from htr_envs import HiddenGoalEnv, HiddenGoalFamily, Trajectory, check_task_env, goal_env_source, hide_goal
+from htr_envs import HiddenGoalEnv, HiddenGoalFamily, HiddenGoalWrapper, Trajectory, check_task_env, goal_env_source, hide_goal
 from htr_envs.goal_env import find_hidden
 from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.common.checks import family_facts
@@ -182,7 +183,24 @@ class OldStepEnv(ReachEnv):
         return observation, reward, terminated, info
 
 
-BAD = (CostlyEnv, InformedEnv, UnseededEnv, PlainEnv, DiscreteEnv, OldEnv, UnseededOldEnv, OldStepEnv)
+class MovingEnv(ReachEnv):
+    """Its goal moves within an episode."""
+
+    def step(self, action: Any) -> Any:
+        self.goal = self.goal + 0.01
+        return super().step(action)
+
+
+class Robot(ReachEnv):
+    """Its goal stays where it was put, until a reset is told another."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        self.goal = np.asarray((options or {}).get("goal", getattr(self, "goal", [0.5, 0.5])))
+        self.position = np.zeros(2)
+        return self._observe(), {}
+
+
+BAD = (MovingEnv, CostlyEnv, InformedEnv, UnseededEnv, PlainEnv, DiscreteEnv, OldEnv, UnseededOldEnv, OldStepEnv)
 _class: Any
 for _class in (ReachEnv, ChoiceEnv, ListEnv, CutEnv, *BAD):
     gym.register(f"Toy{_class.__name__}-v0", entry_point=_class, max_episode_steps=30)
@@ -362,6 +380,7 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     (CHOICE, {"reward_type": "one goal at a time"}, "let it take many goals at once, as HER does"),
     (TOY, {"n_goals": 9}, "drew only 9 different goals"),
     ("ToyUnseededEnv-v0", {}, "draws another goal for the same seed"),
+    ("ToyMovingEnv-v0", {}, "has a goal that moves within an episode"),
     ("ToyCostlyEnv-v0", {}, "must depend on achieved and desired goal alone"),
     ("ToyInformedEnv-v0", {}, "raised KeyError('reward') for goals of shape (n, goal_dim)"),
     ("ToyPlainEnv-v0", {}, "ToyPlainEnv-v0 is no GoalEnv"),
@@ -378,6 +397,44 @@ def test_what_cannot_be_a_family_is_refused_in_a_sentence(env_id: str, env_kwarg
     with pytest.raises(ValueError) as caught:
         HiddenGoalEnv(env_id, env_kwargs)
     assert sentence in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("reward_type", ["sparse", "positive"])
+def test_the_goal_env_itself_is_seen_as_its_family_is(reward_type: str) -> None:
+    robot = Robot()
+    robot.reward_type = reward_type
+    env, family_env = HiddenGoalWrapper(TimeLimit(robot, 30)), HiddenGoalEnv(TOY)
+    assert env.observation_space == family_env.observation_space
+    assert env.reset()[0].tolist() == [0, 0, 0, 0]
+    for steps, reward in ((3, 0.0), (2, 1.0)):
+        for _ in range(steps):
+            observation, paid, *_ = env.step(np.array([1.0, 1.0], dtype=np.float32))
+        assert paid == reward and env.observation_space.contains(observation)
+    assert observation.tolist() == pytest.approx([1, 1, 0.5, 0.5])
+    model = PEARL("MlpPolicy", gym.make(hide_goal(TOY)), **TINY)
+    assert len(model.adapt(env, n_episodes=2).returns) == 2
+    # Another goal is another task, which is begun by whoever says so
+    env.reset(options={"goal": [0.0, 0.0]})
+    assert env.step(np.zeros(2, dtype=np.float32))[1] == 1.0
+
+
+def test_a_goal_that_does_not_stay_is_named() -> None:
+    model = PEARL("MlpPolicy", gym.make(hide_goal(TOY)), **TINY)
+    with pytest.raises(ValueError, match=r"ToyReachEnv-v0 was at another goal, .* HiddenGoal/ToyReachEnv-v0"):
+        model.adapt(HiddenGoalWrapper(gym.make(TOY)), n_episodes=3)
+    env = HiddenGoalWrapper(MovingEnv())
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="MovingEnv was at another goal"):
+        env.step(np.zeros(2, dtype=np.float32))
+
+
+def test_a_robot_whose_rewards_are_not_sparse_is_refused() -> None:
+    dense = HiddenGoalWrapper(gym.make(CHOICE, reward_type="dense"))
+    dense.reset()
+    with pytest.raises(ValueError, match=r"pays 0\.\d+, but a sparse reward is"):
+        dense.step(np.ones(2, dtype=np.float32))
+    with pytest.raises(ValueError, match="ToyPlainEnv-v0 is no GoalEnv"):
+        HiddenGoalWrapper(gym.make("ToyPlainEnv-v0"))
 
 
 def test_no_tasks_are_refused() -> None:
