@@ -340,7 +340,8 @@ def check_is_not_normalized(env: VecEnv) -> None:
     if name is not None:
         raise ValueError(
             f"{name} stands between the env and relabelled rewards, and is not saved with the model: leave it out. "
-            "PEARL's policy normalizes observations itself. Rewards cannot be normalized: all tasks share one scale."
+            "PEARL's and RL2's policies normalize observations themselves (normalize_observations of policy_kwargs). Rewards "
+            "cannot be normalized: all tasks share one scale."
         )
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch as th
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from helpers import ENV_ID
@@ -116,6 +117,31 @@ def test_it_learns_and_is_the_same_after_save_and_load(tmp_path: Any) -> None:
 def test_a_rollout_is_whole_trials_and_a_minibatch_some_of_them() -> None:
     model = tiny_rl2(n_episodes_per_trial=3, n_trials_per_rollout=2)
     assert model.n_steps == 2 * 3 * N_STEPS and model.batch_size == 4 * 3 * N_STEPS
+    assert model.gamma == 1 - 1 / (3 * N_STEPS), "the discount reaches over a trial"
+    assert tiny_rl2(n_episodes_per_trial=5).gamma == 0.99 and tiny_rl2(gamma=0.9).gamma == 0.9
+
+
+def test_it_sees_observations_on_one_scale_and_rewards_as_they_are(tmp_path: Any) -> None:
+    model = tiny_rl2(policy_kwargs={"normalize_observations": True})
+    features = model.policy.features_extractor
+    rows = th.tensor([[3.0, -4.0, 0.5, -0.5, 1.0, 0.0]])
+    assert features(rows).tolist() == rows.tolist(), "nothing was observed yet"
+    seen = []
+
+    class Watch(BaseCallback):
+        def _on_step(self) -> bool:
+            seen.append(self.locals["obs_tensor"].numpy().copy())
+            return True
+
+    model.learn(80, Watch())  # a rollout
+    obs = np.concatenate(seen)
+    expected = (rows[0, :2].numpy() - obs[:, :2].mean(axis=0)) / obs[:, :2].std(axis=0)
+    np.testing.assert_allclose(features(rows)[0, :2].numpy(), np.clip(expected, -10, 10), rtol=1e-4)
+    assert features(rows)[0, 2:].tolist() == rows[0, 2:].tolist()
+    model.save(tmp_path / "model")
+    loaded = RL2.load(tmp_path / "model")
+    (ours, _), (theirs, _) = (evaluate_adaptation(agent, ENV_ID, n_episodes=3, seed=4) for agent in (model, loaded))
+    np.testing.assert_array_equal(ours, theirs)
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,11 @@ from sb3_htr.zoo.run.algorithm import ALGORITHMS
 from sb3_htr.zoo.run.method import methods
 
 SMALL: dict[str, list[str]] = {
-    "rl2": ["n_episodes_per_trial:2", "n_epochs:1", "policy_kwargs:{'lstm_hidden_size':4,'net_arch':[4]}"],
+    "rl2": [
+        "n_episodes_per_trial:2",
+        "n_epochs:1",
+        "policy_kwargs:{'lstm_hidden_size':4,'net_arch':[4],'normalize_observations':True}",
+    ],
     "sac-her": ["gradient_steps:2", "policy_kwargs:{'net_arch':[4]}", "n_envs:8", "buffer_size:2000"],
 }
 STEPS = {"rl2": 3200, "sac-her": 160}

@@ -196,8 +196,8 @@ class MetaExperimentManager(ExperimentManager):
     ) -> tuple[dict[str, Any], Callable[..., Any] | None, list[BaseCallback], Callable[..., Any] | None]:
         if "normalize" in hyperparams:
             raise ValueError(
-                "normalize asks for SB3's VecNormalize, which is not saved with the model: leave it out, the policy "
-                "normalizes observations itself (normalize_observations of policy_kwargs)."
+                "normalize asks for SB3's VecNormalize, which is not saved with the model: leave it out, the policies of "
+                "PEARL and RL2 normalize observations themselves (normalize_observations of policy_kwargs)."
             )
         if elsewhere := sorted(hyperparams.keys() & OPTIONS.keys()):
             raise ValueError(f"{elsewhere[0]} is no hyperparameter: give it by {OPTIONS[elsewhere[0]]}.")
