@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import gymnasium as gym
@@ -37,13 +38,15 @@ class HiddenGoalWrapper(gym.Wrapper[Any, Any, Any, Any]):
         :param seed: as the GoalEnv takes it; with one, the goal may be another.
         :param options: as the GoalEnv takes them; with some, the goal may be another.
         :return: observation (obs_dim,), info of the GoalEnv.
-        :raises ValueError: if the goal is another one without either.
+        :raises ValueError: if the goal is another one without either, or not finite, or the reward is not sparse.
         """
         observation, info = self.env.reset(seed=seed, options=options)
         if not self._goal.size or seed is not None or options:
             self._goal = np.array(observation["desired_goal"])
-            rewards = self.env.get_wrapper_attr("compute_reward")(self._goal[None], self._goal[None], np.full(1, {}))
-            self._success = float(rewards[0])
+            if not np.isfinite(self._goal).all():
+                raise ValueError(f"The desired_goal of {self._name} is {self._goal}, expected finite numbers.")
+            # One goal at a time, as a robot need not take many
+            self._success = float(self.env.get_wrapper_attr("compute_reward")(self._goal, self._goal, {}))
             self._check_sparse(self._success)
         self._check_goal(observation)
         return without_goal(observation), info
@@ -58,6 +61,12 @@ class HiddenGoalWrapper(gym.Wrapper[Any, Any, Any, Any]):
         observation, paid, terminated, truncated, info = self.env.step(action)
         self._check_goal(observation)
         self._check_sparse(float(paid))
+        if terminated and paid == self._success:
+            warnings.warn(
+                f"{self._name} ends an episode where its goal is reached, and HiddenGoal goes on there: the agent has learnt "
+                "to stay, and returns count the steps that it stays for. Let the robot go on up to its time limit.",
+                stacklevel=2,
+            )
         return without_goal(observation), float(paid) - self._success + 1.0, terminated, truncated, info
 
     def _check_sparse(self, reward: float) -> None:

@@ -167,6 +167,20 @@ def test_foresight_is_the_value_of_the_policy_that_has_adapted() -> None:
     assert (np.concatenate(seen["starts"]) == 0).all(), "where the point robot starts"
 
 
+def test_foresight_sees_a_goal_that_was_passed_between_two_steps_of_the_context() -> None:
+    buffer = make_buffer(n_envs=1, relabel_probability=1.0, relabeller=HindsightForesight(context_size=2))
+    add_episode(buffer, [0], 20, np.random.default_rng(0))
+    relabeller, columns = buffer.relabeller, buffer.transitions
+    assert isinstance(relabeller, HindsightForesight)
+    relabeller.policy = Oracle()
+    rows = buffer.episodes.take(np.arange(20))
+    rows[:, columns.next_observation] = 9.0
+    rows[4, columns.next_observation] = FAMILY.train_tasks[3]
+    (utilities,) = relabeller.utilities(rows, np.array([20]))
+    distance = np.linalg.norm(FAMILY.train_tasks - FAMILY.train_tasks[3], axis=-1)
+    np.testing.assert_allclose(utilities, np.where(distance < 0.2, 1 - distance, 0), atol=1e-5)
+
+
 def test_inference_is_the_return_under_the_task() -> None:
     buffer = relabelling(KINDS[1], n_episodes=12)
     relabeller, index = buffer.relabeller, buffer.episodes.index()

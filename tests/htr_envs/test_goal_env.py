@@ -406,10 +406,13 @@ def test_the_goal_env_itself_is_seen_as_its_family_is(reward_type: str) -> None:
     env, family_env = HiddenGoalWrapper(TimeLimit(robot, 30)), HiddenGoalEnv(TOY)
     assert env.observation_space == family_env.observation_space
     assert env.reset()[0].tolist() == [0, 0, 0, 0]
-    for steps, reward in ((3, 0.0), (2, 1.0)):
-        for _ in range(steps):
-            observation, paid, *_ = env.step(np.array([1.0, 1.0], dtype=np.float32))
-        assert paid == reward and env.observation_space.contains(observation)
+    for _ in range(3):
+        observation, paid, *_ = env.step(np.array([1.0, 1.0], dtype=np.float32))
+        assert paid == 0 and env.observation_space.contains(observation)
+    with pytest.warns(UserWarning, match="ends an episode where its goal is reached, and HiddenGoal goes on"):
+        assert env.step(np.array([1.0, 1.0], dtype=np.float32))[1] == 1
+    observation, paid, *_ = env.step(np.array([1.0, 1.0], dtype=np.float32))
+    assert paid == 1.0
     assert observation.tolist() == pytest.approx([1, 1, 0.5, 0.5])
     model = PEARL("MlpPolicy", gym.make(hide_goal(TOY)), **TINY)
     assert len(model.adapt(env, n_episodes=2).returns) == 2
@@ -428,7 +431,15 @@ def test_a_goal_that_does_not_stay_is_named() -> None:
         env.step(np.zeros(2, dtype=np.float32))
 
 
-def test_a_robot_whose_rewards_are_not_sparse_is_refused() -> None:
+def test_a_robot_whose_rewards_are_not_sparse_or_whose_goal_is_none_is_refused() -> None:
+    robot = Robot()
+    robot.reward_type = "one goal at a time"
+    env = HiddenGoalWrapper(robot)
+    env.reset()
+    with pytest.raises(ValueError, match="Robot pays 1, but a sparse reward is"):  # as much as beside its goal
+        env.step(np.zeros(2))
+    with pytest.raises(ValueError, match=r"The desired_goal of Robot is \[nan  0.\], expected finite"):
+        HiddenGoalWrapper(robot).reset(options={"goal": [np.nan, 0.0]})
     dense = HiddenGoalWrapper(gym.make(CHOICE, reward_type="dense"))
     dense.reset()
     with pytest.raises(ValueError, match=r"pays 0\.\d+, but a sparse reward is"):

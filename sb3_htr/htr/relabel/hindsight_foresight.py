@@ -4,6 +4,7 @@ import numpy as np
 import torch as th
 
 from sb3_htr.common.settings import check_numbers
+from sb3_htr.common.task_reward import task_reward
 from sb3_htr.common.type_aliases import Context
 from sb3_htr.htr.groups import evenly_spread, first_rows, positions
 from sb3_htr.htr.relabel.training_task import TrainingTaskRelabelling
@@ -19,8 +20,9 @@ class HindsightForesight(TrainingTaskRelabelling):
     first states of episodes (foresight). Wan, Peng and Gangwani, 2022, https://arxiv.org/abs/2109.09031.
 
     :param temperature: see :class:`TrainingTaskRelabelling`
-    :param context_size: steps of an episode that z is inferred from, evenly spread, at most. As many as
-        the shortest contexts of training have, as each narrows the posterior; HFR's code takes all of them
+    :param context_size: steps of an episode that z is inferred from, evenly spread and one that the task rewards among them if
+        there is any, at most. As many as the shortest contexts of training have, as each narrows the posterior; HFR's code
+        takes all of them
     :param n_starts: first states that the value is a mean over. In HFR's code 64 to 1024; here all tasks begin alike
     :raises ValueError: for a number that is out of its range
     """
@@ -34,12 +36,10 @@ class HindsightForesight(TrainingTaskRelabelling):
     def utilities(self, rows: np.ndarray, lengths: np.ndarray) -> np.ndarray:
         first = first_rows(lengths)
         starts = rows[self.buffer.relabel_rng.choice(first, self.n_starts), self.buffer.transitions.observation]
-        steps, taken = evenly_spread(lengths, self.context_size)
-        rows = rows[steps + np.repeat(first, taken)]
         n = max(CHUNK // self.buffer.n_tasks, 1)
-        ends = np.cumsum(taken)
-        chunks = [(i, min(i + n, len(taken))) for i in range(0, len(taken), n)]
-        return np.concatenate([self._values(rows[ends[i] - taken[i] : ends[j - 1]], taken[i:j], starts) for i, j in chunks])
+        ends = np.cumsum(lengths)
+        chunks = [(i, min(i + n, len(lengths))) for i in range(0, len(lengths), n)]
+        return np.concatenate([self._values(rows[first[i] : ends[j - 1]], lengths[i:j], starts) for i, j in chunks])
 
     def _values(self, rows: np.ndarray, lengths: np.ndarray, starts: np.ndarray) -> np.ndarray:
         """(n_episodes, n_tasks), of acting in ``starts`` (n_starts, obs_dim) with z of each episode under each task."""
@@ -51,7 +51,11 @@ class HindsightForesight(TrainingTaskRelabelling):
         repeated = np.repeat(lengths, n_tasks)
         row = positions(repeated) + np.repeat(np.repeat(first_rows(lengths), n_tasks), repeated)
         task = np.repeat(np.tile(np.arange(n_tasks), n_episodes), repeated)
-        arrays = rows[row, columns.observation], rows[row, columns.action], rewards[task, row], repeated
+        gains = task_reward(rewards[task, row], rows[row, columns.task_free_reward])
+        steps, taken = evenly_spread(repeated, self.context_size, gains)
+        at = steps + np.repeat(first_rows(repeated), taken)
+        row, task = row[at], task[at]
+        arrays = rows[row, columns.observation], rows[row, columns.action], rewards[task, row], taken
         mean, _ = policy.infer(Context(*(th.as_tensor(array, device=policy.device) for array in arrays)))
         z = mean.reshape(n_episodes, n_tasks, -1).repeat(n_starts, 1, 1)
         values = policy.values(np.repeat(starts, n_episodes, axis=0), z)
