@@ -29,12 +29,14 @@ def digest(files: Iterable[Path]) -> str:
 def digest_of_code(modules: Iterable[str]) -> str:
     """
     :param modules: names of modules and packages that are imported
-    :return: of their files
+    :return: of their files; of a module within a package, of all of the package, which it may import, and of the assets there
     """
     files: list[Path] = []
     for module in modules:
-        file = Path(sys.modules[module].__file__ or "")
-        files += sorted(file.parent.rglob("*.py")) if file.name == "__init__.py" else [file]
+        outermost = sys.modules[module.partition(".")[0]]
+        folders = [Path(folder) for folder in getattr(outermost, "__path__", ())]
+        inside = [file for folder in folders for file in sorted(folder.rglob("*")) if file.is_file()]
+        files += [file for file in inside if file.suffix != ".pyc"] if folders else [Path(outermost.__file__ or "")]
     return digest(files)
 
 

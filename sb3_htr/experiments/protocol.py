@@ -121,6 +121,8 @@ _ALL = (
     seconds_to_solved,
 )
 METRICS: dict[str, Callable[[Raw, str], np.ndarray]] = {metric.__name__: metric for metric in _ALL}
+# Of the evaluations within a training, which are by the explorer of the method
+OF_TRAINING = (loss_of_stability.__name__, env_steps_to_solved.__name__, seconds_to_solved.__name__)
 # Of a run that was never solved, they are known to be larger than what they are counted as
 TIMES = (env_steps_to_solved.__name__, seconds_to_solved.__name__)
 

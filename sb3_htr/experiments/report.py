@@ -14,8 +14,8 @@ from sb3_htr.experiments import figures, raw_results
 from sb3_htr.experiments.calibration import expected_calibration_error
 from sb3_htr.experiments.cell import Cell, Evaluation
 from sb3_htr.experiments.grid import Experiment
-from sb3_htr.experiments.protocol import EVAL_SEEDS, METRICS, TIMES, env_steps_to_solved, is_solved, scores
-from sb3_htr.experiments.runner import LOGGED
+from sb3_htr.experiments.protocol import EVAL_SEEDS, METRICS, OF_TRAINING, TIMES, env_steps_to_solved, is_solved, scores
+from sb3_htr.experiments.runner import LOGGED, hyperparams_of
 from sb3_htr.experiments.table import table
 from sb3_htr.zoo.plots.intervals import iqm_difference, iqm_interval
 
@@ -38,6 +38,13 @@ class Runs(NamedTuple):
     def evaluations(self) -> tuple[Evaluation, ...]:
         """Of each of them."""
         return self.cells[0].evaluations
+
+    @property
+    def in_training(self) -> Evaluation:
+        """The one that is by the explorer of the training's own evaluations."""
+        explorer = hyperparams_of(self.cells[0]).get("explorer")
+        name = explorer["name"] if isinstance(explorer, dict) else explorer
+        return next((own for own in self.evaluations if own.explorer == name and not own.tested_on), self.evaluations[0])
 
     def returns(self, evaluation: Evaluation) -> np.ndarray:
         """(n_runs, n_eval_seeds, n_tasks), of the last adaptation episode."""
@@ -94,9 +101,10 @@ def summarize(command: str, results: dict[Cell, Path]) -> dict[str, Any]:
 
 
 def _rows(runs: Runs) -> Iterator[dict[str, Any]]:
-    means = runs.means()
+    means, in_training = runs.means(), runs.in_training
     for evaluation in runs.evaluations:
-        for metric in METRICS:
+        # No other explorer, and no other tasks, have those of the training
+        for metric in [name for name in METRICS if evaluation == in_training or name not in OF_TRAINING]:
             interval: dict[str, Any] = _rounded(iqm_interval(scores(runs.raws, metric, evaluation.name)))
             if metric in TIMES:
                 interval |= _limits(interval, "high", runs)
@@ -114,9 +122,9 @@ def _differences(first: Runs, other: Runs) -> Iterator[dict[str, Any]]:
 
 def _slowdown(first: Runs, other: Runs) -> dict[str, Any]:
     """How many times the env steps of the first variant the other needs to solve enough of the validation tasks, or more."""
-    steps = [np.log(scores(runs.raws, STEPS, runs.evaluations[0].name)) for runs in (other, first)]
+    steps = [np.log(scores(runs.raws, STEPS, runs.in_training.name)) for runs in (other, first)]
     estimate, low, high = np.exp(iqm_difference(*steps))
-    about = other.about(other.evaluations[0])
+    about = other.about(other.in_training)
     interval: dict[str, Any] = _rounded((estimate, low, high))
     limits = {**_limits(interval, "low", first), **_limits(interval, "high", other)}
     return {**about, "of": first.cells[0].variant, "metric": STEPS, **interval, **limits, "n_unsolved": other.n_unsolved}

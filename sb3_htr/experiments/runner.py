@@ -15,7 +15,7 @@ from sb3_htr.adaptation.explorers import to_explorer
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.resume import checkpoints
-from sb3_htr.common.versions import commit, hardware, named
+from sb3_htr.common.versions import commit, hardware, named, versions
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.kept import FOLDER, Kept, digest_of_code
 from sb3_htr.experiments.log import logged
@@ -98,7 +98,7 @@ def run_cell(cell: Cell, runs: Path) -> bool:
 def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
     import_packages(cell.gym_packages)
     # As it was imported, and may be no more when the training has ended
-    code = digest_of_code(("sb3_htr", "htr_envs", *cell.gym_packages))
+    code = json.dumps([digest_of_code(("sb3_htr", "htr_envs", *cell.gym_packages)), versions()])
     trained = find_finished(cell, folder)
     if trained is None:
         _check_loadable(cell)

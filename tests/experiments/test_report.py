@@ -16,7 +16,7 @@ from sb3_htr.common.checks import get_task_family
 from sb3_htr.experiments import figures, protocol, report
 from sb3_htr.experiments.grid import EXPERIMENTS, Experiment, Variant, by
 from sb3_htr.experiments.protocol import METRICS
-from sb3_htr.experiments.runner import LOGGED
+from sb3_htr.experiments.runner import LOGGED, hyperparams_of
 from sb3_htr.experiments.table import table as as_markdown
 from sb3_htr.zoo.run.method import methods
 
@@ -88,7 +88,12 @@ def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monk
         assert row["low"] <= row["iqm"] <= row["high"] and row["method"] in methods()
     # An agent without explorers is evaluated once in each place
     n_tests = sum(len(cell.evaluations) for cell in variants.values())
-    assert len(summary["rows"]) == n_tests * len(value)
+    # What is of the training is of one explorer
+    assert len(summary["rows"]) == n_tests * 3 + len(variants) * 3
+    of_training = [row for row in summary["rows"] if row["metric"] == "env_steps_to_solved"]
+    for row in of_training:
+        own = hyperparams_of(variants[row["variant"], str(row["env_kwargs"])]).get("explorer", "own")
+        assert row["explorer"] == (own["name"] if isinstance(own, dict) else own) and not row["tested_on"]
     of_first = {env_kwargs: len(cell.evaluations) for (_, env_kwargs), cell in reversed(variants.items())}
     assert len(summary["differences"]) == n_tests - sum(of_first.values())
     assert all(difference["low"] <= 0 <= difference["high"] for difference in summary["differences"])

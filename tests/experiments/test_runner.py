@@ -1,5 +1,6 @@
 """Cells of an experiment are runs of the command line."""
 
+import importlib
 import json
 import math
 import shutil
@@ -21,7 +22,7 @@ from sb3_htr.experiments import grid
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.executors import Here
 from sb3_htr.experiments.grid import Experiment, Variant, by
-from sb3_htr.experiments.kept import FOLDER
+from sb3_htr.experiments.kept import FOLDER, digest_of_code
 from sb3_htr.experiments.protocol import evaluate
 from sb3_htr.experiments.runner import find_finished, run_cell
 from sb3_htr.zoo.cli import main
@@ -425,3 +426,19 @@ def test_runs_in_an_object_store_are_refused() -> None:
     """A local folder of that name would be on one node alone."""
     with pytest.raises(ValueError, match="expected a folder: object stores have to be mounted"):
         main(["experiment", "point_robot", "--quick", "--runs", "s3://bucket/runs"])
+
+
+def test_the_digest_of_code_is_of_all_that_it_may_need(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Modules and assets beside the one that is named, in packages with and without ``__init__.py``."""
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "digested").mkdir()
+    for name in ("one.py", "two.py", "robot.xml"):
+        (tmp_path / "digested" / name).touch()
+    (tmp_path / "digested_alone.py").touch()
+    importlib.import_module("digested.one")
+    importlib.import_module("digested_alone")
+    seen = [(digest_of_code(["digested.one"]), digest_of_code(["digested_alone"]))]
+    for name, text in (("digested/two.py", "x = 1"), ("digested/robot.xml", "<mujoco/>"), ("digested_alone.py", "x = 1")):
+        (tmp_path / name).write_text(text)
+        seen.append((digest_of_code(["digested.one"]), digest_of_code(["digested_alone"])))
+    assert len({of_package for of_package, _ in seen}) == 3 and len({alone for _, alone in seen}) == 2
