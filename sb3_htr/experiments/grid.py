@@ -333,7 +333,8 @@ ALL = (
         figure=figures.race,
     ),
     # HTR paper, figure 11. Steps of an episode for each distance: time to get there, and as long again. The budget is that of
-    # episodes of 20 steps; longer ones have as many episodes and updates
+    # episodes of 20 steps; longer ones have as many episodes, and updates in
+    # proportion to env steps
     Experiment(
         "goal_distance",
         "Goals ever further away.",
