@@ -18,7 +18,8 @@ class HiddenGoalWrapper(gym.Wrapper[Any, Any, Any, Any]):
 
     Observations are ``observation`` and ``achieved_goal``, in this order, rewards 1 where the GoalEnv pays that its goal is
     reached and 0 elsewhere. All episodes of an adaptation are of one task, so the goal must stay until ``reset`` is given a
-    seed or options. Most simulations draw one at each reset, and are refused: there, ``HiddenGoal/ID`` does what is wanted.
+    seed or options; another one may have a wrapper of its own, too. Most simulations draw one at each reset, and are refused:
+    there, ``HiddenGoal/ID`` does what is wanted.
 
     :param env: with a sparse reward, -1 and 0 or 0 and 1.
     :raises ValueError: if it is no GoalEnv.

@@ -333,8 +333,7 @@ ALL = (
         figure=figures.race,
     ),
     # HTR paper, figure 11. Steps of an episode for each distance: time to get there, and as long again. The budget is that of
-    # episodes of 20 steps; longer ones have as many episodes, and updates in
-    # proportion to env steps
+    # episodes of 20 steps; longer ones have as many episodes, and updates in proportion to env steps
     Experiment(
         "goal_distance",
         "Goals ever further away.",

@@ -107,7 +107,14 @@ PEARL = SearchSpace(
 
 # What rl_zoo3 samples of recurrent PPO, but for what a trial settles: steps of a rollout and of a minibatch
 RL2 = SearchSpace(
-    floats={**OF_ALL, "one_minus_gae_lambda": (0.005, 0.2), "ent_coef": (1e-4, 1e-1), "max_grad_norm": (0.3, 2.0)},
+    # The discount must reach over a trial, of several episodes
+    floats={
+        **OF_ALL,
+        "one_minus_gamma": (0.001, 0.2),
+        "one_minus_gae_lambda": (0.005, 0.2),
+        "ent_coef": (1e-4, 1e-1),
+        "max_grad_norm": (0.3, 2.0),
+    },
     ints={"n_epochs": (2, 20), "lstm_hidden_size_pow": (5, 8)},
     choices={"clip_range": (0.1, 0.2, 0.3), "net_arch": ARCHS},
     within=dict.fromkeys(("lstm_hidden_size_pow", "net_arch"), ("policy_kwargs",)),
