@@ -22,6 +22,7 @@ NOT_STORED = {
 }
 
 
+@runtime_checkable
 class Adapting(Protocol):
     """An adaptation in progress, such as :class:`sb3_htr.adaptation.Adaptation`."""
 

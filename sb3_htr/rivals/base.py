@@ -269,11 +269,17 @@ class Rival(CheckedFiles, Resumable):
         :param explorer: None or ``"own"``: it explores in its own way
         :param generator: source of randomness; torch's global one by default
         :return: acts, and takes in what happens
-        :raises ValueError: for an explorer, or no task
+        :raises ValueError: for an explorer, or no task; if the rival's own code makes something else than an adaptation
         """
         check_explores_in_own_way(self, explorer)
         check_numbers(n_envs=(n_envs, 1))
-        return self._adaptation(n_envs, generator)
+        adaptation = self._adaptation(n_envs, generator)
+        if not isinstance(adaptation, Adapting):
+            raise ValueError(
+                f"_adaptation of {type(self).__name__} returned {adaptation!r}, expected act, observe, exploring and deviation: "
+                "derive it from RivalAdaptation."
+            )
+        return adaptation
 
     def check_env(self, env: VecEnv) -> None:
         """

@@ -239,6 +239,12 @@ def test_actions_that_are_not_scaled_are_refused(registered: Any, monkeypatch: p
         evaluate_adaptation(registered.PlainPPO("MlpPolicy", ENV_ID), ENV_ID, n_episodes=1)
 
 
+def test_an_adaptation_that_is_none_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(OwnTD3, "_adaptation", lambda self, n_envs, generator: None)
+    with pytest.raises(ValueError, match="_adaptation of OwnTD3 returned None, expected act, observe"):
+        evaluate_adaptation(own_td3(), ENV_ID, n_episodes=1)
+
+
 def test_rollouts_without_the_end_of_an_episode_are_refused(registered: Any) -> None:
     with pytest.raises(ValueError, match="n_steps is 8, and episodes have up to 20 steps: give it as many or more"):
         registered.PlainPPO("MlpPolicy", ENV_ID, n_steps=8)
