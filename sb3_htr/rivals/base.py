@@ -276,8 +276,8 @@ class Rival(CheckedFiles, Resumable):
         adaptation = self._adaptation(n_envs, generator)
         if not isinstance(adaptation, Adapting):
             raise ValueError(
-                f"_adaptation of {type(self).__name__} returned {adaptation!r}, expected act, observe, exploring and deviation: "
-                "derive it from RivalAdaptation."
+                f"_adaptation of {type(self).__name__} returned {adaptation!r}, expected act, observe, exploring and "
+                "deviation: derive it from RivalAdaptation."
             )
         return adaptation
 
