@@ -76,7 +76,7 @@ class WithoutHook(gym.Wrapper[Any, Any, Any, Any]):
         ),
         (
             lambda: VecNormalize(make_task_vec_env(ENV_ID, 2)),
-            "VecNormalize stands between .*policy normalizes observations itself",
+            "VecNormalize stands between .*policies normalize observations themselves",
         ),
         (lambda: DummyVecEnv([lambda: gym.make("Pendulum-v1")]), "no task_family"),
     ],

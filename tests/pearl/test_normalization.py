@@ -129,7 +129,7 @@ def test_without_it_observations_are_as_they_are(tiny_pearl: MakePEARL) -> None:
 @pytest.mark.parametrize("kwargs", [{}, {"norm_reward": False}, {"norm_obs": False, "norm_reward": False}])
 def test_vec_normalize_is_refused(tiny_pearl: MakePEARL, kwargs: dict[str, Any], tmp_path: Path) -> None:
     """At once, and not only where a model is made."""
-    message = r"VecNormalize stands between .*policy normalizes observations itself"
+    message = r"VecNormalize stands between .*policies normalize observations themselves"
     with pytest.raises(ValueError, match=message):
         tiny_pearl(VecNormalize(make_task_vec_env(ENV_ID, 4), **kwargs))
     tiny_pearl().save(tmp_path / "model")

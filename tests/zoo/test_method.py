@@ -148,7 +148,7 @@ def test_settings_of_file_method_and_command_line_are_joined_in_this_order(tmp_p
         (["-params", "n_exploration_episodes:3"], "PEARL has no setting 'n_exploration_episodes'"),
         (
             ["-params", "normalize:True"],
-            "normalize asks for SB3's VecNormalize.*leave it out, the policy normalizes",
+            "normalize asks for SB3's VecNormalize.*leave it out, the policies of PEARL and RL2 normalize",
         ),
         (["-params", "normalize:{'norm_reward':False}"], "normalize asks for SB3's VecNormalize"),
     ],
