@@ -59,7 +59,7 @@ class TrialLstmPolicy(RecurrentActorCriticPolicy):
     :param normalize_observations: both see the env's observations less their running mean in training, divided by the standard
         deviation, as PEARL's networks do by default; here not by default, as in the library
     :param kwargs: of the library's policy
-    :raises ValueError: if normalize_observations is no bool
+    :raises ValueError: if normalize_observations is no bool, or there is another features extractor beside it
     """
 
     def __init__(
@@ -74,6 +74,10 @@ class TrialLstmPolicy(RecurrentActorCriticPolicy):
         check_flags(normalize_observations=normalize_observations)
         self.normalize_observations = normalize_observations
         if normalize_observations:
+            if (given := kwargs.get("features_extractor_class", TrialFeatures)) not in (TrialFeatures, FlattenExtractor):
+                raise ValueError(
+                    f"normalize_observations has features of its own, in the place of {given.__name__}: give one."
+                )
             n_last = LastStep(1, action_space.shape[0]).columns.shape[1]
             kwargs["features_extractor_class"] = TrialFeatures
             kwargs["features_extractor_kwargs"] = {"obs_dim": observation_space.shape[0] - n_last}

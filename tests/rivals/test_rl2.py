@@ -8,6 +8,7 @@ import pytest
 import torch as th
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from helpers import ENV_ID
@@ -151,6 +152,11 @@ def test_it_sees_observations_on_one_scale_and_rewards_as_they_are(tmp_path: Any
         ({"n_trials_per_rollout": 0}, "n_trials_per_rollout is 0, expected a whole number of at least 1"),
         ({"n_steps": 128}, "RL2 has no setting 'n_steps': it follows from n_trials_per_rollout"),
         ({"env": "Pendulum-v1"}, "no task_family"),
+        ({"policy_kwargs": {"normalize_observations": "yes"}}, "normalize_observations is 'yes', expected True or False"),
+        (
+            {"policy_kwargs": {"normalize_observations": True, "features_extractor_class": CombinedExtractor}},
+            "normalize_observations has features of its own, in the place of CombinedExtractor",
+        ),
     ],
 )
 def test_bad_settings_are_refused(settings: dict[str, Any], message: str) -> None:
