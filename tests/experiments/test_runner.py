@@ -429,7 +429,7 @@ def test_runs_in_an_object_store_are_refused() -> None:
 
 
 def test_the_digest_of_code_is_of_all_that_it_may_need(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Modules and assets beside the one that is named, in packages with and without ``__init__.py``."""
+    """Of modules and assets beside one in a folder, and of a module that is alone."""
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "digested").mkdir()
     for name in ("one.py", "two.py", "robot.xml"):
