@@ -151,5 +151,6 @@ def machine() -> str:
     """
     :return: processor, threads and versions, and the GPU where one was used
     """
-    about = f"{hardware()}, {os.cpu_count()} cores, Python {platform.python_version()}, torch {th.__version__}"
+    used = "cuda" if th.cuda.is_initialized() else "cpu"
+    about = f"{hardware(used)}, {os.cpu_count()} cores, Python {platform.python_version()}, torch {th.__version__}"
     return f"{about}, {th.get_num_threads()} thread(s)"

@@ -361,9 +361,11 @@ def test_manifests_of_brackets_are_damaged(tmp_path: Path) -> None:
 
 
 OF_OTHER_CODE = '{"env_id": "a", "env_kwargs": {}, "gym_packages": [], "resumed_by": [1]}'
+OF_NO_MACHINE = '{"env_id": "a", "env_kwargs": {}, "gym_packages": [], "hardware": [1]}'
+DAMAGED = ("", "{", "[]", "null", '{"env_id": 1}', OF_OTHER_CODE, OF_NO_MACHINE, "[" * 100_000, "\x00\xff")
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", "null", '{"env_id": 1}', OF_OTHER_CODE, "[" * 100_000, "\x00\xff"])
+@pytest.mark.parametrize("content", DAMAGED)
 def test_damaged_records_are_named(content: str, tmp_path: Path) -> None:
     (tmp_path / RECORD).write_text(content)
     with pytest.raises(ValueError, match=r"run\.json is damaged, or no record of a run"):

@@ -10,6 +10,8 @@ from typing import Any
 import torch as th
 
 PACKAGES = ("sb3_htr", "stable_baselines3", "sb3_contrib", "gymnasium", "rl_zoo3", "torch", "numpy", "mujoco")
+# Older runs and results do not say
+UNKNOWN_HARDWARE = "a machine that was not recorded"
 
 
 def versions() -> dict[str, str]:
@@ -35,11 +37,13 @@ def processor() -> str:
     return names[0] if names else platform.processor() or platform.machine()
 
 
-def hardware() -> str:
+def hardware(device: th.device | str) -> str:
     """
-    :return: the processor, and the GPU that this process has used, if any
+    :param device: torch device that computes
+    :return: the processor, and the GPU, if it is one that computes
     """
-    return processor() + (f", {th.cuda.get_device_name()}" if th.cuda.is_initialized() else "")
+    device = th.device(device)
+    return processor() + (f", {th.cuda.get_device_name(device)}" if device.type == "cuda" else "")
 
 
 def commit(*paths: str) -> dict[str, str | bool]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.versions import UNKNOWN_HARDWARE
 from sb3_htr.experiments import figures, raw_results
 from sb3_htr.experiments.calibration import expected_calibration_error
 from sb3_htr.experiments.cell import Cell, Evaluation
@@ -89,9 +90,7 @@ def summarize(command: str, results: dict[Cell, Path]) -> dict[str, Any]:
         "command": command,
         **{key: ", ".join(sorted({str(raw[key]) for runs in all_runs for raw in runs.raws})) for key in raw_results.COMMITS},
         "date": date.today().isoformat(),
-        "machine": ", ".join(
-            sorted({str(raw.get("machine", "a machine that was not recorded")) for runs in all_runs for raw in runs.raws})
-        ),
+        "machine": "; ".join(sorted({str(raw.get("machine", UNKNOWN_HARDWARE)) for runs in all_runs for raw in runs.raws})),
         "n_eval_seeds": len(EVAL_SEEDS),
         "rows": [row for runs in all_runs for row in _rows(runs)],
         "differences": [row for first, *others in compared for other in others for row in _differences(first, other)],

@@ -15,7 +15,7 @@ from sb3_htr.adaptation.explorers import to_explorer
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.resume import checkpoints
-from sb3_htr.common.versions import commit, hardware, named, versions
+from sb3_htr.common.versions import UNKNOWN_HARDWARE, commit, hardware, named, versions
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.kept import FOLDER, Kept, digest_of_code
 from sb3_htr.experiments.log import logged
@@ -51,11 +51,16 @@ def lock_of(cell: Cell, runs: Path) -> SystemLock:
     return SystemLock(cell.run_folder(runs) / ".claim")
 
 
-def machine() -> str:
+def machines(record: dict[str, Any]) -> str:
     """
-    :return: what seconds depend on, after a training in this process
+    :param record: of a run, which this process evaluates on the CPU
+    :return: what seconds depend on, and what evaluates, if that is another machine
     """
-    return f"{hardware()}, one thread per run, Python {platform.python_version()}"
+    here, python = hardware("cpu"), platform.python_version()
+    trained_on = record.get("hardware", [UNKNOWN_HARDWARE])
+    about = f"{', then '.join(trained_on)}, one thread per run, Python {record.get('versions', {}).get('python', python)}"
+    same = any(f"{name}, ".startswith(f"{here}, ") for name in trained_on)
+    return about if same else f"{about}, evaluated on {here}, Python {python}"
 
 
 def run_cell(cell: Cell, runs: Path) -> bool:
@@ -130,7 +135,7 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
         # Of the code as it was when the training began, and as it is in this process
         "commit": named(record),
         "evaluation_commit": CODE,
-        "machine": machine(),
+        "machine": machines(record),
         **evaluate(cell, model, record["hyperparams"].get("explorer"), kept),
     }
 

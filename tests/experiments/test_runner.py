@@ -3,6 +3,7 @@
 import importlib
 import json
 import math
+import platform
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from sb3_htr import PEARL, evaluate_adaptation, make_task_vec_env
 from sb3_htr.adaptation.explorers import EXPLORERS, Prior
 from sb3_htr.common.checkpoint import write_checkpoint
 from sb3_htr.common.resume import checkpoints
+from sb3_htr.common.versions import hardware
 from sb3_htr.experiments import grid
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.executors import Here
@@ -93,12 +95,18 @@ def test_a_killed_run_goes_on_and_a_finished_one_is_tested(tmp_path: Path, monke
     monkeypatch.setattr(train, "main", refuse)
     changed = result.stat().st_mtime_ns
     assert run_cell(cell, tmp_path) and result.stat().st_mtime_ns == changed, "a result is not made again"
+    assert str(raw["machine"]) == f"{hardware('cpu')}, one thread per run, Python {platform.python_version()}"
     # As from another place, where it was trained: without checkpoints and results
     shutil.rmtree(run / "checkpoints")
+    record = json.loads((run / "run.json").read_text())
+    there = {"hardware": ["a core", "a core, a GPU"], "versions": {"python": "3.99"}}
+    (run / "run.json").write_text(json.dumps({**record, **there}))
     others = replace(cell, experiment="other", evaluations=by(("prior",)))
     assert run_cell(others, tmp_path)
     again = np.load(others.result(tmp_path))
     assert (again["returns_prior"] == raw["returns_prior"]).all() and "returns_belief" not in again
+    trained = "a core, then a core, a GPU, one thread per run, Python 3.99"
+    assert str(again["machine"]) == f"{trained}, evaluated on {hardware('cpu')}, Python {platform.python_version()}"
     with pytest.raises(
         ValueError,
         match="seed 1, but other/tiny-n_test_tasks10-seed2 needs 2, as the experiment or the YAML file says: move this run",

@@ -378,7 +378,8 @@ def test_a_run_that_goes_on_with_other_code_says_so(unbroken: Path, tmp_path: Pa
     """Defaults are of the code. And what is told of the run tells of both, however often it goes on."""
     run = cut_off(unbroken, tmp_path)
     record = json.loads((run / "run.json").read_text())
-    before = {**record, "commit": "0123456789", "clean": True, "versions": {**record["versions"], "torch": "1.0"}}
+    code = {"commit": "0123456789", "clean": True, "versions": {**record["versions"], "torch": "1.0"}}
+    before = {**record, **code, "hardware": ["a GPU"]}
     (run / "run.json").write_text(json.dumps(before))
     with pytest.warns(UserWarning, match=r"other code .*torch 1\.0 -> .*commit 0123456789 -> "):
         assert main(["train", "--resume", str(run)]) == 0
@@ -388,7 +389,7 @@ def test_a_run_that_goes_on_with_other_code_says_so(unbroken: Path, tmp_path: Pa
     again = cut_off(run, tmp_path / "again")
     assert main(["train", "--resume", str(again)]) == 0
     after = json.loads((again / "run.json").read_text())
-    assert after == {**before, "resumed_by": [resumed]}
+    assert after == {**before, "hardware": ["a GPU", *record["hardware"]], "resumed_by": [resumed]}
     assert named(after) == f"{named(before)}, then {named(record)}"
 
 

@@ -35,7 +35,7 @@ MAX_RECORD = 2**20
 WRAPPERS = ENV_WRAPPER, VEC_ENV_WRAPPER = "env_wrapper", "vec_env_wrapper"
 # What it must say, and what it may say for training on and for model cards
 REQUIRED = {"env_id": str, "env_kwargs": dict, "gym_packages": list}
-OF_TRAINING = {"arguments": list, "n_timesteps": int, "seed": int, "method": str, "hyperparams": dict}
+OF_TRAINING = {"arguments": list, "n_timesteps": int, "seed": int, "method": str, "hyperparams": dict, "hardware": list}
 
 
 @dataclass(frozen=True)
@@ -193,7 +193,7 @@ def read_record(path: Path, content: bytes | None = None) -> dict[str, Any]:
     try:
         record = json.loads(path.read_bytes() if content is None else content)
         given = {name: kind for name, kind in OF_TRAINING.items() if name in record}
-        texts = *record["gym_packages"], *record.get("arguments", ())
+        texts = *record["gym_packages"], *record.get("arguments", ()), *record.get("hardware", ())
         code = record, *record.get("resumed_by", ())
         kinds_are_right = all(type(record[name]) is kind for name, kind in {**REQUIRED, **given}.items())
         kinds_are_right &= all(type(by.get("versions", {})) is dict for by in code)

@@ -29,7 +29,7 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS, SimpleLinearSchedule
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.utils import LinearSchedule, get_device
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 import htr_envs  # noqa: F401 registers the envs
@@ -39,7 +39,7 @@ from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.resume import CheckpointCallback, checkpoints, cut_monitor_files, load_latest
 from sb3_htr.common.settings import check_keywords, check_numbers, keywords_of
 from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
-from sb3_htr.common.versions import differences, made_by
+from sb3_htr.common.versions import UNKNOWN_HARDWARE, differences, hardware, made_by
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.pearl.horizon import timesteps_for
@@ -432,6 +432,8 @@ class MetaExperimentManager(ExperimentManager):
                     "settings that it has. Restore the YAML file, or begin a new run."
                 )
             going_on = dict(record)
+            if (here := self._hardware()) not in (known := record.get("hardware", [UNKNOWN_HARDWARE])):
+                going_on["hardware"] = [*known, here]
             if is_longer:
                 going_on |= {"n_timesteps": self.n_timesteps, "arguments": sys.argv[1:], "hyperparams": now}
             # Defaults are of the code, so what is not in the hyperparameters may be another from here on
@@ -457,10 +459,14 @@ class MetaExperimentManager(ExperimentManager):
             "command": " ".join(sys.argv),
             "arguments": sys.argv[1:],
             "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+            "hardware": [self._hardware()],
             **made_by(),
             "hyperparams": used,
         }
         self._write_record(run)
+
+    def _hardware(self) -> str:
+        return hardware(get_device(self.device))
 
     def _write_record(self, record: dict[str, Any]) -> None:
         with atomic_path(Path(self.save_path) / RECORD) as path:
