@@ -16,6 +16,8 @@ from sb3_htr.zoo.run.trust import import_packages
 EXAMPLE = """  sb3-htr experiment point_robot --jobs 2
   sb3-htr experiment rivals wheeled ant --ray auto --runs /shared/runs
                                                         all methods on three envs, five seeds each, on a Ray cluster
+  sb3-htr experiment rivals wheeled ant --with-results results
+                                                        the same, but for the runs that are in results/ already
   sb3-htr experiment ant --quick                        one seed, a tenth of the env steps: does it run?
   sb3-htr experiment ant --finished                     a table and pictures, of what has been run so far
   sb3-htr experiment mine --gym-packages my_method --with-results results/rivals
@@ -40,8 +42,9 @@ def main(argv: Sequence[str]) -> None:
     outputs = {name: Path("results", quick + name) for name in grids}
     if args.output is not None:
         outputs = {name: args.output / name if len(grids) > 1 else args.output for name in grids}
+    earlier = {name: [folder / name if len(grids) > 1 else folder for folder in args.with_results] for name in grids}
     for name, cells in grids.items():
-        for folder in args.with_results:
+        for folder in earlier[name]:
             print(f"{raw_results.unpack(folder, cells, runs)} of {len(cells)} runs are in {folder}.")
         report.check(finished([cell for cell in cells if cell in of_command], runs))
         if not args.finished and args.cell is None:
@@ -62,7 +65,7 @@ def main(argv: Sequence[str]) -> None:
         print(f"{len(done)} of {len(grids[name])} runs of {name} are finished.")
         if not done or (failed and len(done) < len(grids[name])):
             continue
-        report.write(_command(args, grids[name], outputs[name]), grid.EXPERIMENTS[name], done, outputs[name])
+        report.write(_command(args, grids[name], outputs[name], earlier[name]), grid.EXPERIMENTS[name], done, outputs[name])
         print(f"Results: {outputs[name]}")
     if failed:
         raise failed
@@ -72,13 +75,13 @@ def main(argv: Sequence[str]) -> None:
         )
 
 
-def _command(args: argparse.Namespace, cells: Sequence[Cell], output: Path) -> str:
+def _command(args: argparse.Namespace, cells: Sequence[Cell], output: Path, earlier: Sequence[Path]) -> str:
     """What repeats all runs of an experiment."""
     how = ("--quick " if args.quick else "") + f"--seeds {len({cell.seed for cell in cells})}"
     how += f" --gym-packages {' '.join(args.gym_packages)}" if args.gym_packages else ""
     how += f" --device {args.device}" if args.device != "cpu" else ""
     # Those of its own folder are runs of the experiment, made by this command before
-    others = [str(folder) for folder in args.with_results if folder.resolve() != output.resolve()]
+    others = [str(folder) for folder in earlier if folder.resolve() != output.resolve()]
     how += f" --with-results {' '.join(others)}" if others else ""
     return f"sb3-htr experiment {cells[0].experiment} {how}"
 
@@ -99,7 +102,7 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--runs", type=Path, default=Path("runs"), help=runs)
     output = "folder for the results, of several experiments in OUTPUT/NAME (default: results/NAME)"
     parser.add_argument("-o", "--output", type=Path, help=output)
-    earlier = "folders of results: runs that they have are finished, and not trained again"
+    earlier = "folders of results, of several experiments FOLDER/NAME: runs that they have are finished, and not trained again"
     parser.add_argument("--with-results", type=Path, nargs="+", default=[], metavar="FOLDER", help=earlier)
     device = "torch device to train on (default: cpu, whose bits are promised); final models are evaluated on the CPU"
     parser.add_argument("--device", default="cpu", help=device)
@@ -115,8 +118,6 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
         check_device(args.device)
     if ":/" in str(args.runs):
         raise ValueError(f"--runs is {args.runs}, expected a folder: object stores have to be mounted.")
-    if args.with_results and len(args.names) > 1:
-        raise ValueError("--with-results is for one experiment at a time: runs of several have the same names.")
     return args
 
 

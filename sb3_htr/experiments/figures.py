@@ -1,7 +1,7 @@
 """The pictures of experiments, from the raw results of their cells."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,8 @@ from sb3_htr.zoo.plots.intervals import iqm_interval
 from sb3_htr.zoo.plots.style import BLUE, GREY, curve_colours, save
 
 Results = dict[Cell, Path]
+# Draws the results of an experiment into a file
+Figure = Callable[[Results, Path], None]
 
 
 def by_variant(results: Results, and_env: bool = True) -> dict[str, list[tuple[Cell, Any]]]:
@@ -81,12 +83,13 @@ def learning(results: Results, path: Path) -> None:
     groups = by_variant(results)
     for colour, (variant, runs) in zip(curve_colours([*groups]), groups.items(), strict=True):
         timesteps, curve = curves([raw for _, raw in runs], "curve")
-        band(left, timesteps / 1000, curve, colour, "-", label(variant, runs, results))
+        name = label(variant, runs, results)
+        band(left, timesteps / 1000, curve, colour, "-", name)
         explorers = [evaluation.explorer for evaluation in runs[0][0].evaluations if not evaluation.tested_on]
         styles = {"prior": "--", **dict.fromkeys(explorers[:1], "-")}
         for explorer in [explorer for explorer in explorers if explorer in styles]:
             returns = np.stack([raw[f"returns_{explorer}"] for _, raw in runs])
-            band(right, np.arange(1, returns.shape[-1] + 1), returns, colour, styles[explorer], f"{variant}, {explorer}")
+            band(right, np.arange(1, returns.shape[-1] + 1), returns, colour, styles[explorer], f"{name}, {explorer}")
     left.set_xlim(left=0)
     left.set_xlabel("thousand env steps of meta-training")
     left.set_ylabel("return of the last adaptation episode")

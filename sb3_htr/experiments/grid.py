@@ -1,9 +1,7 @@
 """Every experiment: which methods, on which env, for how long, with how many seeds."""
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import yaml
@@ -67,7 +65,8 @@ class Experiment:
     :param eval_freq: env steps between evaluations on the validation tasks
     :param evaluations: what is done with the final models
     :param models_of: name of the experiment whose runs are tested; by default it trains its own
-    :param figure: draws the results of all cells into a file
+    :param figure: draws the results of all cells into a file, the picture that has the experiment's name
+    :param also: draw pictures with their own names
     :param n_episodes: adaptation episodes on a task, in training's evaluations and in those of the final models
     """
 
@@ -80,7 +79,8 @@ class Experiment:
     eval_freq: int = 10_000
     evaluations: tuple[Evaluation, ...] = by(EXPLORERS)
     models_of: str = ""
-    figure: Callable[[dict[Cell, Path], Path], None] = figures.learning
+    figure: figures.Figure = figures.learning
+    also: tuple[figures.Figure, ...] = (figures.reliability,)
     n_episodes: int = 20
 
     def cells(self, seeds: int | None = None, scale: float = 1.0) -> list[Cell]:
@@ -258,6 +258,7 @@ ALL = (
         (*ON_ROBOTS, Variant("rl2", budget=2.5), Variant("sac-her", budget=0.5)),
         eval_freq=50_000,
         evaluations=OF_ROBOTS,
+        also=(figures.reliability, figures.race),
     ),
     Experiment(
         "ant",
@@ -267,6 +268,7 @@ ALL = (
         (*ON_ROBOTS, Variant("rl2", budget=2.5), Variant("sac-her")),
         eval_freq=100_000,
         evaluations=OF_ROBOTS,
+        also=(figures.reliability, figures.race),
     ),
     Experiment(
         "target_speed",

@@ -11,7 +11,7 @@ import numpy as np
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.versions import UNKNOWN_HARDWARE
-from sb3_htr.experiments import figures, raw_results
+from sb3_htr.experiments import raw_results
 from sb3_htr.experiments.calibration import expected_calibration_error
 from sb3_htr.experiments.cell import Cell, Evaluation
 from sb3_htr.experiments.grid import Experiment
@@ -187,5 +187,6 @@ def write(command: str, experiment: Experiment, results: dict[Cell, Path], folde
     with atomic_path(folder / "summary.json") as path:
         path.write_text(json.dumps(summary, indent=1) + "\n")
     experiment.figure(results, folder / f"{experiment.name}.png")
-    figures.reliability(results, folder / "reliability.png")
+    for draw in experiment.also:
+        draw(results, folder / f"{draw.__name__}.png")
     print(f"\n{table(summary)}")

@@ -70,7 +70,8 @@ def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monk
     cells = experiment.cells(3)
     monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 50)
     report.write(f"sb3-htr experiment {name}", experiment, made_up(cells, tmp_path), folder)
-    assert all((folder / picture).stat().st_size > 10_000 for picture in (f"{name}.png", "reliability.png"))
+    pictures = {name, *(draw.__name__ for draw in experiment.also)}
+    assert all((folder / f"{picture}.png").stat().st_size > 10_000 for picture in pictures)
     for method in {cell.method for cell in cells}:
         raw, own = np.load(folder / f"raw-{method}.npz"), [cell for cell in cells if cell.method == method]
         assert {key.split("/")[0] for key in raw.files} == {cell.name for cell in own}

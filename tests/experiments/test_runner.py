@@ -344,8 +344,12 @@ def test_one_command_runs_several_experiments(tmp_path: Path, monkeypatch: pytes
         summary = json.loads(Path("both", name, "summary.json").read_text())
         assert summary["name"] == name and {row["variant"] for row in summary["rows"]} == {"htr-ser", "rl2"}
         assert summary["command"] == f"sb3-htr experiment {name} --seeds 1"
-    with pytest.raises(ValueError, match="--with-results is for one experiment at a time"):
-        main(["experiment", "near", "far", "--with-results", "both/near"])
+    assert main(["experiment", "near", "far", "-o", "again", "--runs", "elsewhere", "--with-results", "both"]) == 0
+    assert len(queue) == 4, "nothing was trained again"
+    summary = json.loads(Path("again", "far", "summary.json").read_text())
+    assert summary["command"] == "sb3-htr experiment far --seeds 1 --with-results both/far"
+    with pytest.raises(ValueError, match=r"near has no run of near: expected raw-METHOD.npz"):
+        main(["experiment", "near", "far", "--runs", "third", "--with-results", "both/near"])
 
 
 def test_an_experiment_that_is_whole_is_reported_whatever_others_do(
