@@ -26,6 +26,18 @@ FAMILIES = {
 }
 
 
+def test_floors_are_below_ceilings(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    example = importlib.import_module("examples.floor_and_ceiling")
+    scripts = {env_id: scripts for env_id, scripts in example.SCRIPTS.items() if env_id != "SparseAnt-v0"}
+    for name, value in {"N_EPISODES": 1, "SEEDS": range(1), "SCRIPTS": scripts}.items():
+        monkeypatch.setattr(example, name, value)
+    example.main("validation")
+    rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
+    assert [row[-1] for row in rows] == ["0.0000 |", "1.0000 |"] * 2
+    floor, straight, still, drive = (float(row[2].split()[0]) for row in rows)
+    assert floor < 0.1 and straight > 13 and still < 0 and drive > 125
+
+
 DENSE = {
     "half_cheetah_velocity": "HalfCheetahVelocity-v0",
     "ant_direction": "AntDirection-v0",

@@ -26,8 +26,8 @@ class TrainingTaskRelabelling(HindsightBuffers):
     are then. A relabelled row of a meta-batch is drawn as PEARL draws it, from any hindsight buffer that holds something, with
     equal chances. Hindsight buffers take as much memory as the replay.
 
-    :param temperature: what utilities are divided by. Both papers scale rewards instead, at entropy coefficient 1: this is the
-        entropy coefficient that goes with unscaled rewards. 0.01, the default, is the reward scale 100 of PEARL's and HFR's
+    :param temperature: what utilities are divided by. PEARL's and HFR's code scale rewards instead, at entropy coefficient 1:
+        this is the entropy coefficient that goes with unscaled rewards. 0.01, the default, is the reward scale 100 of their
         point robots, and the default of :class:`sb3_htr.PEARL`; HFR's robots have 0.2. Infinity draws tasks evenly
     :raises ValueError: if the temperature is not above 0
     """
