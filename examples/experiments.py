@@ -5,6 +5,7 @@
     sb3-htr experiment sparse_half_cheetah_velocity --gym-packages examples.experiments
     sb3-htr experiment ant_goal --gym-packages examples.experiments
     sb3-htr experiment ant_goal_disc --gym-packages examples.experiments
+    sb3-htr experiment four_corners --gym-packages examples.experiments
     sb3-htr experiment half_cheetah_velocity --gym-packages examples.experiments
     sb3-htr experiment dense_context --gym-packages examples.experiments
 
@@ -15,6 +16,7 @@ rewards are dense: they have PEARL's own protocol.
 from examples import (  # noqa: F401 register the envs
     ant_goal_disc,
     dense_point_robot,
+    four_corners,
     half_cheetah_velocity,
     hidden_target_reacher,
     sparse_half_cheetah_velocity,
@@ -33,6 +35,7 @@ for name, env_id, n_timesteps, n_episodes, variants in (
     # The families of HFR, with HFR and what it was compared with; and that of HyperX
     ("sparse_half_cheetah_velocity", "SparseHalfCheetahVelocity-v0", 1_000_000, 20, RIVALS),
     ("ant_goal", "SparseAnt-v0", 600_000, 20, tuple(Variant(rival.method, env_kwargs=WIDE) for rival in RIVALS)),
+    ("four_corners", "FourCorners-v0", 150_000, 20, RIVALS),
     ("ant_goal_disc", "AntGoalDisc-v0", 600_000, 6, (Variant("htr-ser", settings={"ent_coef": 0.05}),)),
 ):
     EXPERIMENTS[name] = Experiment(

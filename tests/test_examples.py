@@ -23,6 +23,7 @@ FAMILIES = {
     "hidden_target_reacher": "HiddenTargetReacher-v0",
     "sparse_half_cheetah_velocity": "SparseHalfCheetahVelocity-v0",
     "ant_goal_disc": "AntGoalDisc-v0",
+    "four_corners": "FourCorners-v0",
 }
 
 
