@@ -6,6 +6,7 @@ import os
 import shlex
 import shutil
 import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -34,13 +35,15 @@ from sb3_htr.zoo.run.storage import absolute, without_password
 SMALL = ["-params", "n_tasks_per_rollout:4", "n_episodes_per_task:3", "learning_starts:240", "n_envs:4"]
 
 
-def search(folder: Path, storage: str, *more: str, n_trials: int = 2, method: str | None = None) -> int:
+def search_command(folder: Path, storage: str, *more: str, n_trials: int = 2, method: str | None = None) -> list[str]:
     arguments = ["optimize", "--env", ENV_ID, "-f", str(folder), "-n", "480", "--n-trials", str(n_trials), "--seed", "1"]
     # Near goals: trials of any seed have something to report
     arguments += ["--env-kwargs", "goal_distance:0.1", *(["--method", method] if method else [])]
-    return main(
-        [*arguments, "--n-evaluations", "2", "--storage", storage, "--study-name", "test", "--verbose", "0", *more, *SMALL]
-    )
+    return [*arguments, "--n-evaluations", "2", "--storage", storage, "--study-name", "test", "--verbose", "0", *more, *SMALL]
+
+
+def search(folder: Path, storage: str, *more: str, n_trials: int = 2, method: str | None = None) -> int:
+    return main(search_command(folder, storage, *more, n_trials=n_trials, method=method))
 
 
 def check_search(folder: Path, storage: str, capsys: pytest.CaptureFixture[str], method: str | None = None) -> optuna.Study:
@@ -161,6 +164,20 @@ def test_no_password_is_printed() -> None:
 
 def test_a_study_in_postgresql(postgresql: str, quick: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     check_search(tmp_path, postgresql, capsys)
+
+
+def test_two_workers_search_at_once_in_postgresql(postgresql: str, tmp_path: Path) -> None:
+    """As two terminals do, with one command."""
+    small = ["gradient_steps:2", "batch_size:4", "meta_batch_size:4", "policy_kwargs:{'net_arch':[8],'encoder_arch':[8]}"]
+    command = [*search_command(tmp_path, postgresql, "--study-name", "both"), *small]
+    code = f"import sys; from sb3_htr.zoo.cli import main; sys.exit(main({command}))"
+    workers = [subprocess.Popen([sys.executable, "-c", code]) for _ in range(2)]
+    assert [worker.wait(120) for worker in workers] == [0, 0]
+    trials = optuna.load_study(study_name="both", storage=postgresql).trials
+    assert len(trials) == 4 and all(trial.state.is_finished() for trial in trials)
+    assert len({trial.params["learning_rate"] for trial in trials}) == 4
+    first, second = trials[:2]
+    assert first.datetime_complete and second.datetime_start and second.datetime_start < first.datetime_complete, "at once"
 
 
 def test_bad_storages_are_named_in_one_sentence(quick: None, tmp_path: Path) -> None:
