@@ -1,6 +1,7 @@
 """Fixtures, where tests run, and how hard hypothesis looks."""
 
 import os
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -51,3 +52,15 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sb3_htr.zoo.run.search_space.SearchSpace.sample", sample_little)
     monkeypatch.setattr("sb3_htr.zoo.run.search_space.SearchSpace.convert", lambda space, params: params)
     monkeypatch.setattr("sb3_htr.zoo.commands.optimize.PAUSE", 0.05)
+
+
+@pytest.fixture
+def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A :class:`helpers.hub.Hub` in the place of Hugging Face's."""
+    from helpers.hub import Hub  # which only its tests need packages for
+
+    hub = Hub(tmp_path / "hub")
+    monkeypatch.setattr("huggingface_hub.HfApi", lambda: hub)
+    monkeypatch.setattr("huggingface_hub.hf_hub_download", hub.download)
+    monkeypatch.chdir(tmp_path)
+    return hub

@@ -9,10 +9,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
-from huggingface_hub.errors import EntryNotFoundError
 from huggingface_sb3 import EnvironmentName, ModelName
 
 from helpers import ENV_ID, MakePEARL, with_policy
+from helpers.hub import Hub
 from helpers.runs import make_run, run_folder
 from sb3_htr import evaluate_adaptation
 from sb3_htr.common.vec_env import make_task_vec_env
@@ -23,43 +23,6 @@ from sb3_htr.zoo.run.hub import files, model_name
 MODEL = f"pearl-{ENV_ID}.zip"
 # Goals that a random agent comes across, and few of them
 NEAR = {"goal_distance": 0.3, "n_test_tasks": 3}
-
-
-class Hub:
-    """Of the Hugging Face Hub, what one repository has."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.log: list[str] = []
-
-    def create_repo(self, repo_id: str, private: bool, exist_ok: bool) -> Any:
-        assert exist_ok
-        self.log.append(f"{repo_id}, private: {private}")
-        self.folder.mkdir(exist_ok=True)
-        return type("RepoUrl", (str,), {"repo_id": repo_id})(f"https://hub/{repo_id}")
-
-    def upload_folder(
-        self, repo_id: str, folder_path: Path, allow_patterns: list[str], delete_patterns: list[str], commit_message: str
-    ) -> None:
-        for name in delete_patterns:
-            (self.folder / name).unlink(missing_ok=True)
-        for path in folder_path.iterdir():
-            if path.name in allow_patterns:
-                shutil.copy(path, self.folder)
-
-    def download(self, repo_id: str, filename: str) -> str:
-        if not (self.folder / filename).exists():
-            raise EntryNotFoundError(f"404 Client Error.\n\nEntry Not Found for {repo_id}/{filename}.")
-        return str(self.folder / filename)
-
-
-@pytest.fixture
-def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Hub:
-    hub = Hub(tmp_path / "hub")
-    monkeypatch.setattr("huggingface_hub.HfApi", lambda: hub)
-    monkeypatch.setattr("huggingface_hub.hf_hub_download", hub.download)
-    monkeypatch.chdir(tmp_path)
-    return hub
 
 
 def names(folder: Path | str) -> list[str]:

@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 from helpers import ENV_ID
+from helpers.hub import Hub
 from helpers.runs import run_folder
 from sb3_htr import evaluate_adaptation
 from sb3_htr.common.checks import get_max_episode_steps
@@ -66,8 +67,21 @@ def test_all_commands_take_them(method: str, runs: Path, tmp_path: Path, capsys:
         "adaptation_curve",
         "adaptation_paths",
     }
+    film = tmp_path / "film.gif"
+    assert main(["record", str(run), "--n-tasks", "1", *few, "--every", "5", "-o", str(film), "--verbose", "0"]) == 0
+    assert film.stat().st_size > 1000
     with pytest.raises(ValueError, match="has no explorers, but the explorer is 'prior'"):
         main(["evaluate", str(run), "--explorer", "prior"])
+
+
+@pytest.mark.parametrize("method", SMALL)
+def test_they_go_to_the_hub_and_come_back(method: str, runs: Path, hub: Hub) -> None:
+    assert main(["export", str(runs / method), "-o", "shared", "--n-episodes", "1", "--push-to-hub", "me"]) == 0
+    command = f"sb3-htr load_from_hub --env {ENV_ID} -orga me --algo {method}"
+    assert f"$ {command}\n" in Path("shared/README.md").read_text()
+    assert main(command.split()[1:]) == 0
+    ours, theirs = (evaluate_adaptation(agent_at(at).load(), ENV_ID, n_episodes=2) for at in (runs / method, Path("logs")))
+    np.testing.assert_array_equal(ours, theirs)
 
 
 @pytest.mark.parametrize("method", SMALL)
