@@ -39,7 +39,11 @@ COMPARED: dict[str, dict[str, tuple[str, ...]]] = {
         "prior": ("pearl-dense-prior",),
         "wheeled_prior": ("pearl-dense-prior",),
     },
-    "differences:rivals": {"rivals": ("pearl-dense, tuned", "htr-hipi", "htr-hfr", "rl2", "sac-her")},
+    "differences:rivals": {
+        "rivals": ("pearl-dense, tuned", "htr-hipi", "htr-hfr", "rl2", "sac-her"),
+        "wheeled": ("htr-hipi", "htr-hfr", "rl2", "sac-her"),
+        "ant": ("htr-hipi", "htr-hfr", "rl2", "sac-her"),
+    },
 }
 EXPLORERS = {
     "belief": {"last_episode_return": "return", "success_rate": "tasks solved", "episodes_to_first_success": "first success"},
