@@ -84,8 +84,9 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         ``{"name": "EpisodeClustering", "cell_size": 0.2}``
     :param rl_reward_type: ``"sparse"``, or ``"dense"`` for the oracle baseline: RL batches carry the dense proxy reward of
         their task while the context stays sparse
-    :param context_episodes: without relabelling, the context is drawn from this many latest episodes of the task (PEARL
-        draws context from recently collected data)
+    :param context_episodes: without relabelling, the context is drawn from this many latest episodes of the task.
+        :class:`sb3_htr.PEARL` gives what a rollout has on a task, its ``n_episodes_per_task``: the latest collection, as in
+        PEARL's reference
     :param seed: seed of the buffer's own random generators
     :raises ValueError: for a setting that is unknown or out of its range, a family without the hooks that it needs, and a
         capacity below one episode of each task
