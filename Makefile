@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 # Of a user, and of a developer, who needs everything
 BASICS := zoo,video,mujoco
-EXTRAS := $(BASICS),robotics,panda,metaworld,tensorboard,postgresql,docs,dev
+EXTRAS := $(BASICS),robotics,panda,metaworld,tensorboard,postgresql,ray,docs,dev
 INSTALL := $(BIN)/pip install --quiet -c constraints.txt -e
 STAMP := .venv/.installed
 BENCHMARKS := $(filter-out benchmarks/_%,$(wildcard benchmarks/*.py))
