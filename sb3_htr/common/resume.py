@@ -6,7 +6,7 @@ import shutil
 import time
 import warnings
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
@@ -21,6 +21,8 @@ from sb3_htr.common.settings import check_numbers
 
 # What is recorded but not written yet
 LOGGER_STATE = ("name_to_value", "name_to_count", "name_to_excluded")
+# In the folder of a run
+CHECKPOINTS = "checkpoints"
 # Of a callback's attributes, those that are kept
 NUMBERS = (bool, int, float)
 
@@ -43,11 +45,15 @@ def checkpoints(run: Path) -> list[Path]:
     :param run: folder of a run
     :return: its checkpoints, the latest first
     """
-    folders = [path for path in (run / "checkpoints").glob("*_steps") if path.name.removesuffix("_steps").isdecimal()]
-    return sorted(folders, key=_n_steps, reverse=True)
+    folders = [path for path in (run / CHECKPOINTS).glob("*_steps") if path.name.removesuffix("_steps").isdecimal()]
+    return sorted(folders, key=n_steps_at, reverse=True)
 
 
-def _n_steps(checkpoint: Path) -> int:
+def n_steps_at(checkpoint: PurePath) -> int:
+    """
+    :param checkpoint: folder
+    :return: env steps before it
+    """
     return int(checkpoint.name.removesuffix("_steps"))
 
 
@@ -79,7 +85,7 @@ def n_steps_done(run: Path) -> int:
     :param run: folder of a run
     :return: env steps before its latest checkpoint, 0 without one
     """
-    return next(map(_n_steps, checkpoints(run)), 0)
+    return next(map(n_steps_at, checkpoints(run)), 0)
 
 
 def load_latest(run: Path) -> tuple[Path, dict[str, Any]]:
@@ -222,7 +228,7 @@ class CheckpointCallback(BaseCallback):
             self.model._num_timesteps_at_start = self._pending["num_timesteps_at_start"]
             self._pending = None
             return
-        beyond = [folder for folder in checkpoints(self.run) if _n_steps(folder) > self.num_timesteps]
+        beyond = [folder for folder in checkpoints(self.run) if n_steps_at(folder) > self.num_timesteps]
         if beyond:
             raise ValueError(
                 f"{beyond[0]} is a checkpoint of another training, which went further, and the older checkpoints in a folder "
@@ -243,7 +249,7 @@ class CheckpointCallback(BaseCallback):
             self._callback_states()  # one that cannot be saved says so before any work is done
 
     def _save(self) -> None:
-        folder = self.run / "checkpoints" / f"{self.num_timesteps}_steps"
+        folder = self.run / CHECKPOINTS / f"{self.num_timesteps}_steps"
         self._stopped = self.stopping
         try:
             write_checkpoint(folder, self._state())
@@ -271,7 +277,7 @@ class CheckpointCallback(BaseCallback):
     def _remove_old(self) -> None:
         # Those of killed processes, too; but never the one just written, which may be behind others that are damaged
         old_ones = [folder for folder in checkpoints(self.run)[self.keep :] if folder != self._written]
-        for old in [*old_ones, *(self.run / "checkpoints").glob(".*_steps.*.tmp")]:
+        for old in [*old_ones, *(self.run / CHECKPOINTS).glob(".*_steps.*.tmp")]:
             try:
                 shutil.rmtree(old)
             except OSError as error:

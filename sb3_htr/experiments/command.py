@@ -10,6 +10,7 @@ from sb3_htr.common.checks import check_device
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.experiments import driver, executors, grid, raw_results, report
 from sb3_htr.experiments.cell import Cell
+from sb3_htr.experiments.storage import storage_at
 from sb3_htr.zoo.commands.arguments import OF_PACKAGES, make_parser
 from sb3_htr.zoo.run.trust import import_packages
 
@@ -38,29 +39,33 @@ def main(argv: Sequence[str]) -> None:
         chosen = [chosen[args.cell]]
     of_command = {*chosen}
     quick = "quick-" if args.quick else ""
-    runs = (args.runs / "quick" if args.quick else args.runs).resolve()
+    runs = f"{args.runs}/quick" if args.quick else args.runs
+    storage = storage_at(runs)
+    here = storage.fetch_results(chosen)
     outputs = {name: Path("results", quick + name) for name in grids}
     if args.output is not None:
         outputs = {name: args.output / name if len(grids) > 1 else args.output for name in grids}
     earlier = {name: [folder / name if len(grids) > 1 else folder for folder in args.with_results] for name in grids}
     for name, cells in grids.items():
         for folder in earlier[name]:
-            print(f"{raw_results.unpack(folder, cells, runs)} of {len(cells)} runs are in {folder}.")
-        report.check(finished([cell for cell in cells if cell in of_command], runs))
+            print(f"{raw_results.unpack(folder, cells, here)} of {len(cells)} runs are in {folder}.")
+        report.check(finished([cell for cell in cells if cell in of_command], here))
         if not args.finished and args.cell is None:
             raw_results.check_none_lost(outputs[name], cells)
+    storage.send_results(chosen)
     failed: ValueError | None = None
     if not args.finished:
-        here = executors.Here() if args.cell is not None else executors.Processes(args.jobs)
+        on_this_machine = executors.Here() if args.cell is not None else executors.Processes(args.jobs)
         try:
-            driver.Driver(chosen, runs, executors.Ray(args.ray, args.device) if args.ray else here).run()
+            driver.Driver(chosen, runs, executors.Ray(args.ray, args.device) if args.ray else on_this_machine).run()
         except KeyboardInterrupt:
-            print(f"\nStopped. What ran goes on from its checkpoint in {runs} with the same command.", file=sys.stderr)
+            print(f"\nStopped. What ran goes on from its checkpoint in {storage} with the same command.", file=sys.stderr)
             raise SystemExit(130) from None
         except ValueError as error:
             # Experiments whose cells are all done have their results before it is raised
             failed = error
-    results = {} if args.cell is not None else {name: finished(cells, runs) for name, cells in grids.items()}
+    here = storage.fetch_results(chosen)
+    results = {} if args.cell is not None else {name: finished(cells, here) for name, cells in grids.items()}
     for name, done in results.items():
         print(f"{len(done)} of {len(grids[name])} runs of {name} are finished.")
         if not done or (failed and len(done) < len(grids[name])):
@@ -71,7 +76,7 @@ def main(argv: Sequence[str]) -> None:
         raise failed
     if nothing := [name for name, done in results.items() if not done]:
         raise ValueError(
-            f"No run of {' and of '.join(nothing)} is finished in {runs}: run it without --finished, or name other --runs."
+            f"No run of {' and of '.join(nothing)} is finished in {storage}: run it without --finished, or name other --runs."
         )
 
 
@@ -98,8 +103,8 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("names", nargs="+", choices=list(grid.EXPERIMENTS), metavar="NAME", help=several)
     parser.add_argument("--seeds", type=int, help="runs of each variant (default: those of the experiment)")
     parser.add_argument("--quick", action="store_true", help="a tenth of the env steps, and one seed unless told otherwise")
-    runs = "folder for the runs; those of an experiment resume from RUNS/NAME (default: runs)"
-    parser.add_argument("--runs", type=Path, default=Path("runs"), help=runs)
+    runs = "folder for the runs, or a URL of fsspec; those of an experiment resume from RUNS/NAME (default: runs)"
+    parser.add_argument("--runs", default="runs", help=runs)
     output = "folder for the results, of several experiments in OUTPUT/NAME (default: results/NAME)"
     parser.add_argument("-o", "--output", type=Path, help=output)
     earlier = "folders of results, of several experiments FOLDER/NAME: runs that they have are finished, and not trained again"
@@ -116,8 +121,6 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     check_numbers(**{name: (n, 1) for name, n in given.items() if n is not None})
     if not args.ray:  # whose nodes may have others
         check_device(args.device)
-    if ":/" in str(args.runs):
-        raise ValueError(f"--runs is {args.runs}, expected a folder: object stores have to be mounted.")
     return args
 
 

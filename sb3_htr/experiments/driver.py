@@ -1,6 +1,5 @@
 """Runs the cells of experiments on an executor: skips what is done, tries again what failed, waits for what others run."""
 
-import os
 import sys
 import time
 from collections import Counter
@@ -9,29 +8,26 @@ from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from datetime import timedelta
 from pathlib import Path
 
-from filelock import Timeout
-
-from sb3_htr.common.resume import n_steps_done
 from sb3_htr.experiments.cell import Cell
-from sb3_htr.experiments.runner import lock_of, run_cell
+from sb3_htr.experiments.storage import storage_at
 
 # Failures of a cell without a new checkpoint in between, after which it is given up
 ATTEMPTS = 3
-# Seconds between two looks at the folder, and between two lines in a file; looks take at most a tenth of the time
+# Seconds between two looks at the storage, and between two lines in a file; looks take at most a tenth of the time
 PERIOD, LINES = 5.0, 60.0
 
 
 class Driver:
     """
-    Knows of the cells of experiments what is in the folder of the runs, and no more: others may run them, too.
+    Knows of the cells of experiments what is in the storage of the runs, and no more: others may run them, too.
 
     :param cells: of one experiment, or of several
-    :param runs: folder of all experiments' runs, which all nodes see under this name
+    :param runs: folder of all experiments' runs, or URL of fsspec, which all nodes see under this name
     :param executor: where cells run
     """
 
-    def __init__(self, cells: Sequence[Cell], runs: Path, executor: Executor) -> None:
-        self.cells, self.runs, self.executor = cells, runs.resolve(), executor
+    def __init__(self, cells: Sequence[Cell], runs: str | Path, executor: Executor) -> None:
+        self.cells, self.runs, self.executor = cells, storage_at(runs), executor
         self.failed: dict[str, str] = {}
         self._futures: dict[Future[bool], Cell] = {}
         self._failures: Counter[tuple[str, int]] = Counter()
@@ -44,13 +40,13 @@ class Driver:
 
         :raises ValueError: if cells failed, once all others are done
         """
-        self.runs.mkdir(parents=True, exist_ok=True)
+        self.runs.prepare()
         try:
             while todo := self._look():
                 submitted = {cell.label for cell in self._futures.values()}
                 for cell in todo:
-                    if cell.label not in submitted and not self.is_claimed(cell):
-                        self._futures[self.executor.submit(run_cell, cell, self.runs)] = cell
+                    if cell.label not in submitted and not self.runs.is_claimed(cell):
+                        self._futures[self.executor.submit(self.runs.run, cell)] = cell
                 self._wait()
         except BaseException:
             # Ctrl-C reaches what runs on this machine, too: it stops before its next rollout, with a checkpoint
@@ -58,10 +54,9 @@ class Driver:
             raise
         self.executor.shutdown()
         # What was given up here may have been done elsewhere
-        results = self._results()
-        for cell in self.cells:
-            if cell.result(self.runs) in results:
-                self.failed.pop(cell.label, None)
+        self.runs.look(self.cells)
+        for cell in filter(self.runs.is_finished, self.cells):
+            self.failed.pop(cell.label, None)
         if self.failed:
             reasons = " ".join(f"{name}: {reason}" for name, reason in self.failed.items())
             raise ValueError(
@@ -73,33 +68,8 @@ class Driver:
         """
         :return: cells that have no result, and were not given up
         """
-        results = self._results()
-        return [cell for cell in self.cells if cell.result(self.runs) not in results and cell.label not in self.failed]
-
-    def _results(self) -> set[Path]:
-        """Result files. A listing is fresh where answers about single files may be remembered, as by NFS."""
-        folders = {cell.result(self.runs).parent for cell in self.cells}
-        return {folder / name for folder in folders if folder.exists() for name in os.listdir(folder)}
-
-    def is_claimed(self, cell: Cell) -> bool:
-        """
-        :param cell: of the experiment
-        :return: whether a process runs it
-        """
-        if not cell.run_folder(self.runs).exists():
-            return False
-        try:
-            lock_of(cell, self.runs).acquire(timeout=0).lock.release()
-        except Timeout:
-            return True
-        return False
-
-    def n_steps(self, cell: Cell) -> int:
-        """
-        :param cell: of the experiment
-        :return: env steps before its latest checkpoint
-        """
-        return max((n_steps_done(run) for run in cell.run_folder(self.runs).glob("*/*")), default=0)
+        self.runs.look(self.cells)
+        return [cell for cell in self.cells if not self.runs.is_finished(cell) and cell.label not in self.failed]
 
     def line(self, todo: Sequence[Cell]) -> str:
         """
@@ -110,7 +80,7 @@ class Driver:
         left = self._n_steps_left(todo)
         given_up = self._n_steps_left([cell for cell in self.cells if cell.label in self.failed])
         start, before = self._start = self._start or (now, left)
-        n_running = sum(self.is_claimed(cell) for cell in todo)
+        n_running = sum(self.runs.is_claimed(cell) for cell in todo)
         parts = [f"{len(self.cells) - len(todo) - len(self.failed)} of {len(self.cells)} cells done", f"{n_running} running"]
         parts += [f"{len(self.failed)} failed"] if self.failed else []
         parts += [f"{100 * (total - left - given_up) // max(total, 1)} % of the env steps"]
@@ -119,7 +89,7 @@ class Driver:
         return ", ".join(parts)
 
     def _n_steps_left(self, cells: Sequence[Cell]) -> int:
-        return sum(max(cell.n_timesteps - self.n_steps(cell), 0) for cell in cells)
+        return sum(max(cell.n_timesteps - self.runs.n_steps(cell), 0) for cell in cells)
 
     def _look(self) -> list[Cell]:
         start = time.monotonic()
@@ -142,16 +112,17 @@ class Driver:
 
     def _end(self, cell: Cell, future: Future[bool]) -> None:
         error = future.exception()
+        self.runs.look(self.cells)
         if isinstance(error, Exception):
             # Ray's text is a traceback, with the error at its end
             self._fail(cell, f"{type(error).__name__}: {error}".strip().splitlines()[-1])
         elif error is not None:
             raise error
-        elif future.result() and cell.result(self.runs) not in self._results():
+        elif future.result() and not self.runs.is_finished(cell):
             self._fail(cell, f"its node has a result that is not in {self.runs} here: give --runs that all nodes see.")
 
     def _fail(self, cell: Cell, reason: str) -> None:
-        at = cell.label, self.n_steps(cell)
+        at = cell.label, self.runs.n_steps(cell)
         self._failures[at] += 1
         given_up = self._failures[at] == ATTEMPTS
         what = f"failed {ATTEMPTS} times" if given_up else "failed, and is tried again"

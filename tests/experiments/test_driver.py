@@ -21,6 +21,7 @@ from sb3_htr.experiments.driver import ATTEMPTS, Driver
 from sb3_htr.experiments.executors import Here, Processes
 from sb3_htr.experiments.grid import EXPERIMENTS, Experiment, Variant
 from sb3_htr.experiments.runner import lock_of, run_cell
+from sb3_htr.experiments.storage.folder import SharedFolder
 from sb3_htr.zoo.cli import main
 
 CELLS = Experiment("toy", "", "SparsePointRobot-v0", 1000, (Variant("htr-ser"), Variant("htr-ec", "K = 0.8")), 3).cells()
@@ -146,9 +147,9 @@ def test_a_node_that_sees_another_folder_is_found_out(trains: Any, tmp_path: Pat
         run_cell(CELLS[0], tmp_path / "elsewhere")
 
     class OtherDisk(Here):
-        def submit(self, fn: Any, cell: Any, runs: Any) -> Any:  # type: ignore[override]
+        def submit(self, fn: Any, cell: Any) -> Any:  # type: ignore[override]
             (tmp_path / "other").mkdir(exist_ok=True)
-            return super().submit(fn, cell, tmp_path / "other")
+            return super().submit(SharedFolder(tmp_path / "other").run, cell)
 
     with pytest.raises(ValueError, match="its node has a result that is not in"):
         Driver(CELLS[:1], tmp_path / "here", OtherDisk()).run()
@@ -167,11 +168,11 @@ def test_the_claim_of_a_killed_process_is_void(tmp_path: Path) -> None:
     held = context.Event()
     process = context.Process(target=_hold, args=(cell, tmp_path, held))
     process.start()
-    assert held.wait(10) and Driver([cell], tmp_path, Here()).is_claimed(cell)
+    assert held.wait(10) and SharedFolder(tmp_path).is_claimed(cell)
     assert process.pid is not None
     os.kill(process.pid, signal.SIGKILL)
     process.join()
-    assert not Driver([cell], tmp_path, Here()).is_claimed(cell)
+    assert not SharedFolder(tmp_path).is_claimed(cell)
 
 
 def test_a_killed_worker_process_takes_no_other_with_it() -> None:

@@ -44,7 +44,7 @@ def test_a_method_of_ones_own_is_trained_alone_and_reported_beside_what_others_r
         made_up([cell], cell.result(runs).parent)
         return True
 
-    monkeypatch.setattr("sb3_htr.experiments.driver.run_cell", train)
+    monkeypatch.setattr("sb3_htr.experiments.storage.folder.run_cell", train)
     monkeypatch.setattr(executors, "Processes", lambda _: executors.Here())
     assert main(["experiment", "mine", "--with-results", "published"]) == 0
     assert "6 of 8 runs are in published." in capsys.readouterr().out

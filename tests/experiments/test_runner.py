@@ -308,7 +308,7 @@ def test_one_cell_of_a_job_array_writes_no_tables(tmp_path: Path, monkeypatch: p
         ran.append((cell.name, runs))
         return True
 
-    monkeypatch.setattr("sb3_htr.experiments.driver.run_cell", make_result)
+    monkeypatch.setattr("sb3_htr.experiments.storage.folder.run_cell", make_result)
     monkeypatch.chdir(tmp_path)
     assert main(["experiment", "pair", "--cell", "1", "--runs", "here"]) == 0
     assert ran == [("htr-ser-seed2", tmp_path / "here")] and not Path("results").exists()
@@ -333,7 +333,7 @@ def test_one_command_runs_several_experiments(tmp_path: Path, monkeypatch: pytes
         )
         experiment = Experiment(name, "", ENV_ID, 480, variants, 1, eval_freq=240, evaluations=by(("prior",)))
         monkeypatch.setitem(grid.EXPERIMENTS, name, experiment)
-    monkeypatch.setattr("sb3_htr.experiments.driver.run_cell", train)
+    monkeypatch.setattr("sb3_htr.experiments.storage.folder.run_cell", train)
     monkeypatch.setattr("sb3_htr.experiments.executors.Processes", lambda _: Here())
     monkeypatch.chdir(tmp_path)
     assert main(["experiment", "near", "far", "--cell", "3"]) == 0
@@ -365,7 +365,7 @@ def test_an_experiment_that_is_whole_is_reported_whatever_others_do(
     for name, n_seeds in (("broken", 2), ("whole", 1)):
         experiment = Experiment(name, "", ENV_ID, 480, (Variant("htr-ser"),), n_seeds, evaluations=by(("prior",)))
         monkeypatch.setitem(grid.EXPERIMENTS, name, experiment)
-    monkeypatch.setattr("sb3_htr.experiments.driver.run_cell", train)
+    monkeypatch.setattr("sb3_htr.experiments.storage.folder.run_cell", train)
     monkeypatch.setattr("sb3_htr.experiments.executors.Processes", lambda _: Here())
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match=r"1 of 3 cells failed 3 times .*no luck"):
@@ -417,7 +417,7 @@ def test_runs_are_on_the_cpu_unless_a_device_is_given(
 
     only = Experiment("only", "", ENV_ID, 480, (Variant("htr-ser"),), 1, eval_freq=240, evaluations=by(("prior",)))
     monkeypatch.setitem(grid.EXPERIMENTS, "only", only)
-    monkeypatch.setattr("sb3_htr.experiments.driver.run_cell", run)
+    monkeypatch.setattr("sb3_htr.experiments.storage.folder.run_cell", run)
     monkeypatch.setattr("sb3_htr.experiments.command.executors.Processes", lambda n_jobs: Here())
     monkeypatch.setattr("sb3_htr.experiments.command.check_device", lambda device: None)
     monkeypatch.chdir(tmp_path)
@@ -432,12 +432,6 @@ def test_runs_are_on_the_cpu_unless_a_device_is_given(
 def test_a_device_that_there_is_not_is_refused() -> None:
     with pytest.raises(ValueError, match="The device 'gpu' cannot be used: give cpu, cuda or cuda:N"):
         main(["experiment", "point_robot", "--device", "gpu"])
-
-
-def test_runs_in_an_object_store_are_refused() -> None:
-    """A local folder of that name would be on one node alone."""
-    with pytest.raises(ValueError, match="expected a folder: object stores have to be mounted"):
-        main(["experiment", "point_robot", "--quick", "--runs", "s3://bucket/runs"])
 
 
 def test_the_digest_of_code_is_of_all_that_it_may_need(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

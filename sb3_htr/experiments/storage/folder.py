@@ -1,0 +1,68 @@
+"""Runs in a folder that all nodes see under one name, with the locks of its file system."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from filelock import Timeout
+
+from sb3_htr.common.resume import n_steps_done
+from sb3_htr.experiments.cell import Cell
+from sb3_htr.experiments.runner import lock_of, run_cell
+
+
+class SharedFolder:
+    """
+    A :class:`sb3_htr.experiments.storage.Storage`.
+
+    :param runs: folder of all experiments' runs
+    """
+
+    def __init__(self, runs: Path) -> None:
+        self.runs = runs.resolve()
+        self._listed: set[Path] = set()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return SharedFolder, (self.runs,)
+
+    def __str__(self) -> str:
+        return str(self.runs)
+
+    def prepare(self) -> None:
+        """Make it."""
+        self.runs.mkdir(parents=True, exist_ok=True)
+
+    def look(self, cells: Sequence[Cell]) -> None:
+        """A listing is fresh where answers about single files may be remembered, as by NFS."""
+        folders = {cell.result(self.runs).parent for cell in cells}
+        self._listed = {folder / name for folder in folders if folder.exists() for name in os.listdir(folder)}
+
+    def is_finished(self, cell: Cell) -> bool:
+        """Whether it has a result."""
+        return cell.result(self.runs) in self._listed
+
+    def is_claimed(self, cell: Cell) -> bool:
+        """Whether a process has its lock."""
+        if not cell.run_folder(self.runs).exists():
+            return False
+        try:
+            lock_of(cell, self.runs).acquire(timeout=0).lock.release()
+        except Timeout:
+            return True
+        return False
+
+    def n_steps(self, cell: Cell) -> int:
+        """Env steps before its latest checkpoint."""
+        return max((n_steps_done(run) for run in cell.run_folder(self.runs).glob("*/*")), default=0)
+
+    def run(self, cell: Cell) -> bool:
+        """See :func:`sb3_htr.experiments.runner.run_cell`."""
+        return run_cell(cell, self.runs)
+
+    def fetch_results(self, cells: Sequence[Cell]) -> Path:
+        """They are there."""
+        return self.runs
+
+    def send_results(self, cells: Sequence[Cell]) -> None:
+        """They are there."""

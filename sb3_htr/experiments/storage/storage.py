@@ -1,0 +1,71 @@
+"""Where the runs of experiments are: a folder, or a storage of fsspec, that all nodes see."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol
+
+from sb3_htr.experiments.cell import Cell
+from sb3_htr.experiments.storage.folder import SharedFolder
+from sb3_htr.experiments.storage.objects import ObjectStorage
+
+
+class Storage(Protocol):
+    """What a driver asks, and a command. What is said of a cell is as of the latest look, or newer."""
+
+    def prepare(self) -> None:
+        """
+        Before anything is run.
+
+        :raises OSError: if nothing can be written there
+        """
+
+    def look(self, cells: Sequence[Cell]) -> None:
+        """
+        :param cells: that will be asked about
+        """
+
+    def is_finished(self, cell: Cell) -> bool:
+        """
+        :param cell: of an experiment
+        :return: whether it has a result
+        """
+
+    def is_claimed(self, cell: Cell) -> bool:
+        """
+        :param cell: of an experiment
+        :return: whether a process runs it
+        """
+
+    def n_steps(self, cell: Cell) -> int:
+        """
+        :param cell: of an experiment
+        :return: env steps before its latest checkpoint
+        """
+
+    def run(self, cell: Cell) -> bool:
+        """
+        In whatever process an executor calls it.
+
+        :param cell: of an experiment
+        :return: whether there is a result; if not, another process runs the cell
+        """
+
+    def fetch_results(self, cells: Sequence[Cell]) -> Path:
+        """
+        :param cells: of experiments
+        :return: folder of this machine that has the results of those that are finished
+        """
+
+    def send_results(self, cells: Sequence[Cell]) -> None:
+        """
+        :param cells: of which the folder of :meth:`fetch_results` may have results that were not there
+        """
+
+
+def storage_at(runs: str | Path) -> Storage:
+    """
+    :param runs: a folder, or a URL of fsspec, as ``s3://bucket/runs``
+    :return: where the runs are
+    :raises ValueError: if no such URL can be opened here
+    """
+    return ObjectStorage(runs) if isinstance(runs, str) and "://" in runs else SharedFolder(Path(runs))
