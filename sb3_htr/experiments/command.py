@@ -39,7 +39,7 @@ def main(argv: Sequence[str]) -> None:
         chosen = [chosen[args.cell]]
     of_command = {*chosen}
     quick = "quick-" if args.quick else ""
-    runs = f"{args.runs}/quick" if args.quick else args.runs
+    runs = f"{args.runs.rstrip('/')}/quick" if args.quick else args.runs
     storage = storage_at(runs)
     here = storage.fetch_results(chosen)
     outputs = {name: Path("results", quick + name) for name in grids}

@@ -46,7 +46,7 @@ class Driver:
                 submitted = {cell.label for cell in self._futures.values()}
                 for cell in todo:
                     if cell.label not in submitted and not self.runs.is_claimed(cell):
-                        self._futures[self.executor.submit(self.runs.run, cell)] = cell
+                        self._futures[self.executor.submit(*self.runs.call(cell))] = cell
                 self._wait()
         except BaseException:
             # Ctrl-C reaches what runs on this machine, too: it stops before its next rollout, with a checkpoint
@@ -112,7 +112,7 @@ class Driver:
 
     def _end(self, cell: Cell, future: Future[bool]) -> None:
         error = future.exception()
-        self.runs.look(self.cells)
+        self.runs.look([cell])
         if isinstance(error, Exception):
             # Ray's text is a traceback, with the error at its end
             self._fail(cell, f"{type(error).__name__}: {error}".strip().splitlines()[-1])

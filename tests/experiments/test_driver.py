@@ -147,9 +147,9 @@ def test_a_node_that_sees_another_folder_is_found_out(trains: Any, tmp_path: Pat
         run_cell(CELLS[0], tmp_path / "elsewhere")
 
     class OtherDisk(Here):
-        def submit(self, fn: Any, cell: Any) -> Any:  # type: ignore[override]
+        def submit(self, fn: Any, cell: Any, runs: Any) -> Any:  # type: ignore[override]
             (tmp_path / "other").mkdir(exist_ok=True)
-            return super().submit(SharedFolder(tmp_path / "other").run, cell)
+            return super().submit(fn, cell, tmp_path / "other")
 
     with pytest.raises(ValueError, match="its node has a result that is not in"):
         Driver(CELLS[:1], tmp_path / "here", OtherDisk()).run()

@@ -1,5 +1,7 @@
-"""Runs in a storage of fsspec: each cell has one result, and a node that is gone costs what it had not sent."""
+"""Runs in an object store: each cell has one result, and a node that is gone costs what it had not sent."""
 
+import itertools
+import os
 import pickle
 import shutil
 import signal
@@ -13,17 +15,15 @@ from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
-from uuid import uuid4
 
-import fsspec
 import numpy as np
 import pytest
 import torch as th
-from fsspec.implementations.memory import MemoryFileSystem
 from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers import ENV_ID
+from helpers.bucket import PROTOCOL, Bucket
 from helpers.results import made_up
 from sb3_htr.experiments import driver as driver_module
 from sb3_htr.experiments import grid
@@ -33,9 +33,9 @@ from sb3_htr.experiments.executors import Here
 from sb3_htr.experiments.grid import Experiment, Variant, by
 from sb3_htr.experiments.runner import find_finished, run_cell
 from sb3_htr.experiments.storage import claim as claim_module
-from sb3_htr.experiments.storage import objects
+from sb3_htr.experiments.storage import objects, storage_at
 from sb3_htr.experiments.storage.claim import Claim, Watch
-from sb3_htr.experiments.storage.objects import ObjectStorage
+from sb3_htr.experiments.storage.objects import ObjectStore
 from sb3_htr.experiments.storage.working_copy import WorkingCopy
 from sb3_htr.zoo.cli import main
 
@@ -50,31 +50,35 @@ TINY: dict[str, Any] = {
     "batch_size": 4,
     "policy_kwargs": {"net_arch": [8], "encoder_arch": [8]},
 }
+TINY_RUN = Variant("htr-ser", "tiny", TINY, {"n_test_tasks": 4})
 # A node that runs a cell, with a checkpoint after each rollout, and sends all the time
 NODE = """
 import pickle, sys
 from pathlib import Path
-from sb3_htr.experiments.storage import objects
+import helpers.bucket
 from sb3_htr.experiments.cell import Cell
+from sb3_htr.experiments.storage import objects
 
 objects.SEND = 0.02
 training = Cell.training
 Cell.training = lambda cell, folder: [*training(cell, folder), "--save-freq", "1"]
-objects.ObjectStorage(sys.argv[1]).run(pickle.loads(Path(sys.argv[2]).read_bytes()))
+objects.run_on_copy(pickle.loads(Path(sys.argv[2]).read_bytes()), sys.argv[1])
 """
 
 
 @pytest.fixture
-def url() -> str:
-    """Of a storage of this process."""
-    return f"memory://{uuid4().hex}/runs"
+def url(tmp_path: Path) -> str:
+    """Of a store."""
+    return f"{PROTOCOL}://{tmp_path / 'store'}"
 
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Looks are frequent, and who is silent is soon taken for dead."""
+    """Looks are frequent, who is silent is soon taken for dead, and what fails is soon tried again."""
     monkeypatch.setattr(driver_module, "PERIOD", 0.02)
-    monkeypatch.setattr(claim_module, "VOID", 0.5)
+    monkeypatch.setattr(claim_module, "VOID", 2.0)
+    monkeypatch.setattr(objects, "RENEW", 0.05)
+    monkeypatch.setattr(objects, "PATIENCE", (0.01, 0.01))
     monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 50)
 
 
@@ -86,10 +90,11 @@ def trains(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Cell, Path], 
         trained: list[str] = []
 
         def run(cell: Cell, runs: Path) -> bool:
-            trained.append(cell.name)
-            function(cell, cell.run_folder(runs))
-            cell.result(runs).parent.mkdir(parents=True, exist_ok=True)
-            made_up([cell], cell.result(runs).parent)
+            if not cell.result(runs).exists():
+                trained.append(cell.name)
+                function(cell, cell.run_folder(runs))
+                cell.result(runs).parent.mkdir(parents=True, exist_ok=True)
+                made_up([cell], cell.result(runs).parent)
             return True
 
         monkeypatch.setattr(objects, "run_cell", run)
@@ -98,23 +103,64 @@ def trains(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Cell, Path], 
     return make
 
 
-def test_of_several_that_claim_the_same_one_gets_it() -> None:
-    files = fsspec.filesystem("memory")
-    for _ in range(20):
-        folder = f"/{uuid4().hex}"
-        claims = [Claim(files, folder) for _ in range(8)]
-        with ThreadPoolExecutor(8) as pool:
-            taken = list(pool.map(Claim.take, claims))
-        assert sum(taken) == 1 and [claim.is_ours() for claim in claims] == taken
+def failing(monkeypatch: pytest.MonkeyPatch, method: str, times: int, path: str = "") -> None:
+    """The store is out of reach for so many calls of this method, of objects with this in their paths."""
+    whole, left = getattr(Bucket, method), [times]
+
+    def call(self: Bucket, *args: Any, **kwargs: Any) -> Any:
+        if any(path in str(arg) for arg in args) and left[0] > 0:
+            left[0] -= 1
+            raise RuntimeError("out of reach")
+        return whole(self, *args, **kwargs)
+
+    monkeypatch.setattr(Bucket, method, call)
 
 
-def test_who_is_silent_loses_a_claim_and_who_is_done_leaves_it() -> None:
-    files, folder = fsspec.filesystem("memory"), f"/{uuid4().hex}"
+class AtOnce(Bucket):
+    """Several see the same listing before any of them makes an object."""
+
+    cachable = False
+
+    def __init__(self, n: int) -> None:
+        super().__init__()
+        self.barrier, self.looks = threading.Barrier(n), itertools.count(1)
+
+    def find(self, *args: Any, **kwargs: Any) -> Any:
+        found = super().find(*args, **kwargs)
+        if next(self.looks) <= self.barrier.parties:
+            self.barrier.wait(10)
+        return found
+
+
+class KnowsNoCreate(AtOnce):
+    """Overwrites, as some do."""
+
+    def pipe_file(self, path: str, value: bytes, mode: str = "overwrite", **_: Any) -> None:
+        super().pipe_file(path, value)
+        # All of them before any one looks
+        if mode == "create":
+            self.barrier.wait(10)
+
+
+@pytest.mark.parametrize("kind", [AtOnce, KnowsNoCreate])
+def test_of_several_that_claim_the_same_at_once_one_gets_it(kind: type[AtOnce], tmp_path: Path) -> None:
+    claims = [Claim(kind(8), str(tmp_path))]
+    claims += [Claim(claims[0].files, str(tmp_path)) for _ in range(7)]
+    with ThreadPoolExecutor(8) as pool:
+        taken = list(pool.map(Claim.take, claims))
+    assert sum(taken) == 1 and [claim.is_ours() for claim in claims] == taken
+
+
+def test_who_is_silent_loses_a_claim_and_who_is_done_leaves_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(claim_module, "VOID", 0.5)
+    files, folder, watch = Bucket(), str(tmp_path / "claims"), Watch()
     silent, other, third = (Claim(files, folder) for _ in range(3))
-    watch = Watch()
 
     def newest() -> tuple[str, dict[str, Any]]:
         return max(files.find(folder, detail=True).items())
+
+    def content() -> bytes:
+        return files.cat_file(newest()[0])
 
     assert silent.take() and watch.is_alive(*newest()) and not other.take()
     for _ in range(4):
@@ -123,8 +169,10 @@ def test_who_is_silent_loses_a_claim_and_who_is_done_leaves_it() -> None:
         assert watch.is_alive(*newest()), "as long as it is renewed"
     time.sleep(0.6)
     assert not watch.is_alive(*newest())
-    void = newest()[0]
-    assert other.take(void) and not third.take(void), "what is void is taken over once"
+    void = content()
+    silent.renew()
+    assert not other.take(void), "it lives after all"
+    assert other.take(content()) and not third.take(void), "what is void is taken over once"
     assert other.is_ours() and not silent.is_ours() and watch.is_alive(*newest())
     # Comes back
     silent.renew()
@@ -132,29 +180,30 @@ def test_who_is_silent_loses_a_claim_and_who_is_done_leaves_it() -> None:
     assert other.is_ours()
     other.release()
     assert not watch.is_alive(*newest()) and not other.is_ours()
-    assert third.take() and not other.is_ours()
+    assert third.take() and not other.is_ours() and watch.is_alive(*newest())
 
 
-class Failing(MemoryFileSystem):
+class Failing(Bucket):
     """Goes away after so many files."""
 
     cachable = False
     left = 0
 
-    def put_file(self, *args: Any, **kwargs: Any) -> None:
+    def put_file(self, lpath: str, rpath: str, **_: Any) -> None:
         self.left -= 1
         if self.left < 0:
-            raise OSError("gone")
-        super().put_file(*args, **kwargs)
+            # As some say of what is there no more
+            raise FileNotFoundError("gone")
+        super().put_file(lpath, rpath)
 
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(0, 8)), max_size=8))
-def test_a_storage_has_at_any_time_what_a_killed_run_leaves(rollouts: list[tuple[bool, int]]) -> None:
+def test_a_store_has_at_any_time_what_a_killed_run_leaves(rollouts: list[tuple[bool, int]]) -> None:
     """However far a node came with sending: a checkpoint that is whole, and logs as new as it."""
-    files, there, sent = Failing(), f"/{uuid4().hex}", 0
+    files, sent = Failing(), 0
     with TemporaryDirectory() as folder:
-        here = Path(folder, "here")
-        copy = WorkingCopy(files, there, here)
+        here, there = Path(folder, "here"), str(Path(folder, "there"))
+        copy = WorkingCopy(files, there, here, lambda: True)
         for number, (saves, files.left) in enumerate(rollouts, start=1):
             write(here / "progress.csv", "row\n" * number)
             # One more is begun
@@ -166,9 +215,10 @@ def test_a_storage_has_at_any_time_what_a_killed_run_leaves(rollouts: list[tuple
                     shutil.rmtree(old)
             with suppress(OSError):
                 copy.send()
-                sent = number if saves else sent
+                sent = max([int(path.name[0]) for path in here.glob("checkpoints/?_steps")], default=0)
+                assert len(list(Path(there).glob("checkpoints/?_steps/*"))) == 2 * min(sum(s for s, _ in rollouts[:number]), 2)
             fetched = Path(folder, str(number))
-            WorkingCopy(files, there, fetched).fetch()
+            WorkingCopy(files, there, fetched, lambda: True).fetch()
             whole = [path.name for path in fetched.glob("checkpoints/*") if len(list(path.iterdir())) == 2]
             latest = max((int(name[0]) for name in whole), default=0)
             assert latest >= sent and not list(fetched.rglob(".*"))
@@ -181,7 +231,7 @@ def write(path: Path, text: str) -> None:
 
 
 def test_several_drivers_share_the_cells_and_none_runs_twice(
-    url: str, trains: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    url: str, trains: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def work(cell: Cell, folder: Path) -> None:
         write(folder / "htr-ser/run_1/checkpoints/500_steps/state.pt", "half")
@@ -198,51 +248,72 @@ def test_several_drivers_share_the_cells_and_none_runs_twice(
     assert sorted(trained) == sorted([CELLS[0].name, *(cell.name for cell in CELLS)]), "what failed is tried again"
     out, err = capsys.readouterr()
     assert "6 of 6 cells done" in out and "failed, and is tried again at 500 env steps: RuntimeError: no luck" in err
-    storage = ObjectStorage(url)
-    here = storage.fetch_results(CELLS)
-    assert all(cell.result(here).exists() and not storage.is_claimed(cell) for cell in CELLS)
+    store = ObjectStore(url)
+    here = store.fetch_results(CELLS)
+    assert all(cell.result(here).exists() and not store.is_claimed(cell) for cell in CELLS)
     Driver(CELLS, url, Here()).run()
     assert len(trained) == 7, "what is done is skipped"
 
 
-def test_one_that_was_taken_for_dead_sends_nothing(url: str, trains: Any) -> None:
-    """Its cell goes on from what it had sent before."""
-    (cell, *_), storage = CELLS, ObjectStorage(url)
+def test_a_node_at_work_is_not_taken_for_dead(url: str, trains: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(claim_module, "VOID", 0.5)
+    store, cell = ObjectStore(url), CELLS[0]
 
     def work(cell: Cell, folder: Path) -> None:
-        storage.look([cell])
-        assert storage.is_claimed(cell)
-        (path,) = storage.files.find(f"{storage.root}/{cell.experiment}/{cell.name}/.claim")
-        assert Claim(storage.files, path.rpartition("/")[0]).take(void=path)
+        for _ in range(15):
+            time.sleep(0.1)
+            store.look([cell])
+            assert store.is_claimed(cell)
+
+    trained = trains(work)
+    assert objects.run_on_copy(cell, url)
+    store.look([cell])
+    assert store.is_finished(cell) and not store.is_claimed(cell) and len(trained) == 1
+
+
+def test_one_that_was_taken_for_dead_sends_nothing(url: str, trains: Any) -> None:
+    """Its cell goes on from what it had sent before."""
+    (cell, *_), store = CELLS, ObjectStore(url)
+
+    def work(cell: Cell, folder: Path) -> None:
+        store.look([cell])
+        assert store.is_claimed(cell)
+        (path,) = store.files.find(f"{store.root}/{cell.experiment}/{cell.name}/.claims")
+        renewed = threading.Event()
+        while not renewed.is_set():
+            # Between two signs of life
+            if Claim(store.files, path.rpartition("/")[0]).take(void=store.files.cat_file(path)):
+                renewed.set()
         write(folder / "late.txt", "")
 
     trained = trains(work)
-    assert not storage.run(cell) and not storage.run(cell) and trained == [cell.name]
-    assert not storage.files.glob(f"{storage.root}/**/late.txt")
-    storage.look([cell])
-    assert not storage.is_finished(cell) and storage.is_claimed(cell)
+    assert not objects.run_on_copy(cell, url) and not objects.run_on_copy(cell, url) and trained == [cell.name]
+    assert not list(Path(store.root).rglob("late.txt"))
+    store.look([cell])
+    assert not store.is_finished(cell) and store.is_claimed(cell)
 
 
-def test_a_killed_node_costs_what_it_had_not_sent(tmp_path: Path) -> None:
+def test_a_killed_node_costs_what_it_had_not_sent(tmp_path: Path, url: str) -> None:
     """The result is that of a run that nobody disturbed."""
-    (cell,) = Experiment("one", "", ENV_ID, 4800, (Variant("htr-ser", "tiny", TINY),), 1, 480, by(("prior",))).cells()
-    pickled, url = tmp_path / "cell", f"local://{tmp_path / 'storage'}"
+    (cell,) = Experiment("one", "", ENV_ID, 2400, (TINY_RUN,), 1, 480, by(("prior",))).cells()
+    pickled = tmp_path / "cell"
     pickled.write_bytes(pickle.dumps(cell))
-    node = subprocess.Popen([sys.executable, "-c", NODE, url, str(pickled)])
-    storage = ObjectStorage(url)
-    while not 0 < storage.n_steps(cell) < 4000:
+    paths = os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])
+    node = subprocess.Popen([sys.executable, "-c", NODE, url, str(pickled)], env={**os.environ, "PYTHONPATH": paths})
+    store = ObjectStore(url)
+    while not 0 < store.n_steps(cell) < 2000:
         assert node.poll() is None
-        storage.look([cell])
+        store.look([cell])
     node.send_signal(signal.SIGKILL)
     node.wait()
-    storage.look([cell])
-    assert storage.is_claimed(cell) and not storage.run(cell), "it may be at work"
+    store.look([cell])
+    assert store.is_claimed(cell) and not objects.run_on_copy(cell, url), "it may be at work"
     Driver([cell], url, Here()).run()
-    (run,) = (tmp_path / "storage" / "one").glob("tiny-seed1/htr-ser/*")
+    (run,) = (tmp_path / "store" / "one").glob("*/htr-ser/*")
     assert "Going on from" in (run.parents[1] / "log.txt").read_text() and not list(run.rglob("evaluated"))
     (tmp_path / "undisturbed").mkdir()
     assert run_cell(cell, tmp_path / "undisturbed")
-    folders = tmp_path / "storage", tmp_path / "undisturbed"
+    folders = tmp_path / "store", tmp_path / "undisturbed"
     ours, theirs = (np.load(cell.result(folder)) for folder in folders)
     assert (ours["returns_prior"] == theirs["returns_prior"]).all() and (ours["curve"] == theirs["curve"]).all()
     models = [find_finished(cell, cell.run_folder(folder)) for folder in folders]
@@ -250,14 +321,59 @@ def test_a_killed_node_costs_what_it_had_not_sent(tmp_path: Path) -> None:
     assert len(weights) == 2 and all(th.equal(weights[0][name], weights[1][name]) for name in weights[1])
 
 
-def test_the_command_runs_in_a_storage_and_reports_from_it(
+@pytest.mark.parametrize(
+    ("method", "times", "path", "n_trained"),
+    [
+        ("find", 3, "store/toy", 1),
+        ("put_file", 2, "seed1.npz", 1),
+        ("pipe_file", 4, ".claims", 1),
+        ("put_file", 3, "seed1.npz", 2),
+    ],
+    ids=["look", "result", "claims", "result, for longer"],
+)
+def test_a_store_that_is_out_of_reach_for_a_while_costs_little(
+    method: str, times: int, path: str, n_trained: int, url: str, trains: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def work(cell: Cell, folder: Path) -> None:
+        if len(trained) == 1:
+            failing(monkeypatch, method, times, path)
+        time.sleep(0.1)
+
+    trained = trains(work)
+    with monkeypatch.context() as patch:
+        patch.setattr(objects, "FEW", 0)
+        Driver(CELLS[:1], url, ThreadPoolExecutor(1)).run()
+    assert len(trained) == n_trained
+    store = ObjectStore(url)
+    assert CELLS[0].result(store.fetch_results(CELLS[:1])).exists()
+
+
+def test_evaluations_are_kept_until_the_result_is_there(url: str, trains: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which may have taken longer than the training."""
+
+    def work(cell: Cell, folder: Path) -> None:
+        kept = folder / "htr-ser/run_1/evaluated/belief.npz"
+        assert kept.exists() == (len(trained) > 1)
+        write(kept, "")
+        time.sleep(0.2)
+        shutil.rmtree(kept.parent)
+
+    monkeypatch.setattr(objects, "SEND", 0.05)
+    trained = trains(work)
+    failing(monkeypatch, "put_file", 3, f"{CELLS[0].name}.npz")
+    Driver(CELLS[:1], url, Here()).run()
+    assert len(trained) == 2
+
+
+def test_the_command_runs_in_a_store_and_reports_from_it(
     url: str, trains: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trained = trains(lambda cell, folder: None)
     pair = Experiment("pair", "", ENV_ID, 480, (Variant("htr-ser"),), 2, eval_freq=240, evaluations=by(("prior",)))
     monkeypatch.setitem(grid.EXPERIMENTS, "pair", pair)
     monkeypatch.setattr("sb3_htr.experiments.executors.Processes", lambda _: Here())
-    monkeypatch.chdir(tmp_path)
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
     with pytest.raises(ValueError, match=f"No run of pair is finished in {url}"):
         main(["experiment", "pair", "--finished", "--runs", url])
     assert main(["experiment", "pair", "--cell", "1", "--runs", url]) == 0
@@ -267,26 +383,33 @@ def test_the_command_runs_in_a_storage_and_reports_from_it(
     assert main(["experiment", "pair", "--runs", f"{url}/elsewhere", "--finished", "-o", "once more"]) == 0
     assert len(trained) == 2 and "2 of 2 runs of pair are finished." in capsys.readouterr().out
     assert {path.name for path in Path().iterdir()} == {"results", "again", "once more"}, "no runs are here"
+    assert main(["experiment", "pair", "--quick", "--runs", f"{url}/"]) == 0
+    assert (tmp_path / "store" / "quick" / "pair").is_dir()
 
 
-@pytest.mark.parametrize(("runs", "reason"), [("nope://bucket/runs", "Protocol not known: nope")])
-def test_a_url_that_cannot_be_opened_is_refused(runs: str, reason: str) -> None:
-    with pytest.raises(ValueError, match=rf"{runs} cannot be opened \({reason}\): give a folder, or a URL of fsspec"):
-        main(["experiment", "point_robot", "--runs", runs])
+@pytest.mark.parametrize(
+    ("runs", "message"),
+    [
+        ("nope://bucket/runs", r"nope://bucket/runs cannot be opened \(Protocol not known: nope\): give a folder, or a URL"),
+        ("memory://", "memory:// names no place in a store: give one, as in s3://bucket/runs"),
+        ("s3:/bucket/runs", "The folder of the runs is 's3:/bucket/runs': give a URL as text, with two slashes"),
+        (Path("s3://bucket/runs"), "The folder of the runs is 's3:/bucket/runs': give a URL as text, with two slashes"),
+    ],
+)
+def test_what_is_neither_folder_nor_store_is_refused(runs: str | Path, message: str) -> None:
+    """A local folder of that name would be on one node alone."""
+    with pytest.raises(ValueError, match=message):
+        storage_at(runs)
 
 
-def test_a_storage_that_cannot_be_used_is_said_before_anything_is_run(
+def test_a_store_that_cannot_be_used_is_said_before_anything_is_run(
     url: str, trains: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trained = trains(lambda cell, folder: None)
-
-    def refuse(*_: Any, **__: Any) -> None:
-        raise RuntimeError("no credentials")
-
-    monkeypatch.setattr(MemoryFileSystem, "pipe_file", refuse)
-    with pytest.raises(OSError, match=rf"{url} cannot be written to: no credentials"):
+    failing(monkeypatch, "pipe_file", 99)
+    with pytest.raises(OSError, match=rf"{url} cannot be written to: out of reach"):
         main(["experiment", "point_robot", "--runs", url])
-    monkeypatch.setattr(MemoryFileSystem, "find", refuse)
-    with pytest.raises(OSError, match=rf"{url} cannot be read: no credentials"):
+    failing(monkeypatch, "find", 99)
+    with pytest.raises(OSError, match=rf"{url} cannot be read: out of reach"):
         main(["experiment", "point_robot", "--runs", url, "--finished"])
     assert not trained

@@ -1,4 +1,4 @@
-"""Who works on something in a storage that has no locks."""
+"""Who works on something in a store that has no locks."""
 
 import time
 from contextlib import suppress
@@ -9,14 +9,25 @@ from fsspec import AbstractFileSystem
 
 # Seconds between two signs of life, and without any, after which an owner is taken for dead
 RENEW, VOID = 20.0, 180.0
+FREE = b"free"
+
+Claims = dict[str, dict[str, Any]]
+
+
+def claims_among(objects: Claims) -> Claims:
+    """
+    :param objects: paths, and what the store says of them
+    :return: those that are claims
+    """
+    return {path: info for path, info in objects.items() if path.rpartition("/")[2].isdecimal()}
 
 
 class Claim:
     """
-    The newest object in a folder is its owner's, who renews it while at work, and empties it in the end. What is empty is
-    nobody's, and neither is what :class:`Watch` saw nobody renew.
+    The newest object in a folder is its owner's, who renews it while at work, and leaves it :data:`FREE` in the end. What
+    :class:`Watch` saw nobody renew is nobody's, too.
 
-    :param files: of the storage
+    :param files: of the store
     :param folder: in it
     """
 
@@ -24,33 +35,36 @@ class Claim:
         self.files, self.folder = files, folder
         self._path, self._token, self._count = "", uuid4().hex, 0
 
-    def take(self, void: str | None = None) -> bool:
+    def take(self, void: bytes | None = None) -> bool:
         """
-        :param void: path of a claim whose owner is gone
+        :param void: content of a claim whose owner is gone; one that was renewed since has another
         :return: whether it is ours now
         """
         claims = self._claims()
         newest = max(claims, default=None)
-        if newest is not None and newest != void and claims[newest]["size"]:
+        if newest is not None and self.files.cat_file(newest) not in (FREE, void):
             return False
         # A number is never used again, so that whoever comes back sees that it was taken for dead
         self._path = f"{self.folder}/{int(newest.rpartition('/')[2]) + 1 if newest else 0:08}"
-        self.files.makedirs(self.folder, exist_ok=True)
         try:
             self.files.pipe_file(self._path, self._content(), mode="create")
-        except FileExistsError:
+        except OSError:
+            # That there is one is not said alike everywhere, nor always of two at once
+            if self._claims().keys() <= claims.keys():
+                raise
+        # Where a store knows no "create", the latest of several at once has it
+        if not self.is_ours():
             return False
         for path in claims:
             with suppress(FileNotFoundError):
                 self.files.rm_file(path)
-        # Where a storage knows no "create", the latest of several at once has it
-        return self.is_ours()
+        return True
 
     def is_ours(self) -> bool:
         """
         :return: whether nobody took it over
         """
-        newest = max(self._claims(), default="")
+        newest = max(self._claims(), default=None)
         return newest == self._path and self.files.cat_file(newest).startswith(self._token.encode())
 
     def renew(self) -> None:
@@ -62,13 +76,12 @@ class Claim:
     def release(self) -> None:
         """Leave it to whoever comes."""
         if self.is_ours():
-            self.files.pipe_file(self._path, b"")
+            self.files.pipe_file(self._path, FREE)
 
-    def _claims(self) -> dict[str, Any]:
+    def _claims(self) -> Claims:
         # Others write, too
         self.files.invalidate_cache()
-        claims: dict[str, Any] = self.files.find(self.folder, detail=True)
-        return claims
+        return claims_among(self.files.find(self.folder, detail=True))
 
     def _content(self) -> bytes:
         return f"{self._token} {self._count}".encode()
@@ -83,10 +96,10 @@ class Watch:
     def is_alive(self, path: str, info: dict[str, Any]) -> bool:
         """
         :param path: of a claim
-        :param info: what its storage says of it now
-        :return: whether it changed within the last :data:`VOID` seconds; what is seen for the first time did
+        :param info: what its store says of it now
+        :return: whether it is not free, and changed within the last :data:`VOID` seconds; what is seen for the first time did
         """
         now, shown = time.monotonic(), str(info)
         if path not in self._seen or self._seen[path][0] != shown:
             self._seen[path] = shown, now
-        return bool(info["size"]) and now - self._seen[path][1] < VOID
+        return info["size"] != len(FREE) and now - self._seen[path][1] < VOID

@@ -21,10 +21,7 @@ class SharedFolder:
 
     def __init__(self, runs: Path) -> None:
         self.runs = runs.resolve()
-        self._listed: set[Path] = set()
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return SharedFolder, (self.runs,)
+        self._listed: dict[Path, set[str]] = {}
 
     def __str__(self) -> str:
         return str(self.runs)
@@ -36,11 +33,12 @@ class SharedFolder:
     def look(self, cells: Sequence[Cell]) -> None:
         """A listing is fresh where answers about single files may be remembered, as by NFS."""
         folders = {cell.result(self.runs).parent for cell in cells}
-        self._listed = {folder / name for folder in folders if folder.exists() for name in os.listdir(folder)}
+        self._listed |= {folder: set(os.listdir(folder)) if folder.exists() else set() for folder in folders}
 
     def is_finished(self, cell: Cell) -> bool:
         """Whether it has a result."""
-        return cell.result(self.runs) in self._listed
+        result = cell.result(self.runs)
+        return result.name in self._listed.get(result.parent, ())
 
     def is_claimed(self, cell: Cell) -> bool:
         """Whether a process has its lock."""
@@ -56,9 +54,9 @@ class SharedFolder:
         """Env steps before its latest checkpoint."""
         return max((n_steps_done(run) for run in cell.run_folder(self.runs).glob("*/*")), default=0)
 
-    def run(self, cell: Cell) -> bool:
+    def call(self, cell: Cell) -> tuple[Any, ...]:
         """See :func:`sb3_htr.experiments.runner.run_cell`."""
-        return run_cell(cell, self.runs)
+        return run_cell, cell, self.runs
 
     def fetch_results(self, cells: Sequence[Cell]) -> Path:
         """They are there."""

@@ -1,123 +1,116 @@
-"""Runs in a storage of fsspec, as S3, GCS or Azure: a node works on a copy of a cell's folder, and sends what it becomes."""
+"""Runs in an object store, by fsspec: a node works on a copy of a cell's folder, and sends what it becomes."""
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from threading import Event, Thread
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
+from fsspec import AbstractFileSystem
 from fsspec.core import url_to_fs
 
 from sb3_htr.common.errors import last_line
 from sb3_htr.common.resume import CHECKPOINTS, n_steps_at
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.runner import run_cell
-from sb3_htr.experiments.storage.claim import RENEW, Claim, Watch
+from sb3_htr.experiments.storage.claim import RENEW, Claim, Claims, Watch, claims_among
 from sb3_htr.experiments.storage.working_copy import WorkingCopy
 
+T = TypeVar("T")
 # Seconds between two times that a node sends what is new
 SEND = 60.0
-CLAIM = ".claim"
+# Seconds to wait between several tries of what must not be lost
+PATIENCE = (2.0, 8.0, 30.0, 60.0)
+# So many cells are looked at one by one, of more whole experiments
+FEW = 8
+CLAIMS = ".claims"
 
 
-class ObjectStorage:
+class ObjectStore:
     """
-    A :class:`sb3_htr.experiments.storage.Storage`. It has what a folder would have, but for what a node wrote since it last
-    sent. Of two processes that begin a cell, one gets it; one that is taken for dead and comes back sends nothing any more.
+    A :class:`sb3_htr.experiments.storage.Storage`.
 
     :param url: of fsspec
-    :param void: of cells, by label, the claims whose owners are gone
     :raises ValueError: if it cannot be opened here
     """
 
-    def __init__(self, url: str, void: Mapping[str, str] | None = None) -> None:
-        self.url = url.rstrip("/")
-        try:
-            self.files, root = url_to_fs(self.url)
-        except (ValueError, ImportError) as error:
-            raise ValueError(f"{url} cannot be opened ({last_line(error)}): give a folder, or a URL of fsspec.") from None
-        self.root = root.rstrip("/")
-        self._void = dict(void or {})
+    def __init__(self, url: str) -> None:
+        self.url = url
+        self.files, self.root = _opened(url)
         self._watch = Watch()
-        self._objects: dict[str, dict[str, Any]] = {}
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return ObjectStorage, (self.url, self._void)
+        self._void: dict[str, bytes] = {}
+        self._objects: dict[str, Claims] = {}
 
     def __str__(self) -> str:
         return self.url
 
     def prepare(self) -> None:
         """
-        Make it, and write to it.
+        Write to it.
 
         :raises OSError: if that is not possible, for whatever reason
         """
         try:
-            self.files.makedirs(self.root, exist_ok=True)
             self.files.pipe_file(f"{self.root}/.writable", b"")
-        except Exception as error:  # each storage has its own
+        except Exception as error:  # each store has its own
             raise OSError(f"{self.url} cannot be written to: {last_line(error)}") from None
 
     def look(self, cells: Sequence[Cell]) -> None:
-        """One listing for each experiment."""
-        self._objects = {}
+        """If the store is out of reach, what was seen before holds until the next look."""
+        _unless_it_fails(lambda: self._look(cells))
+
+    def _look(self, cells: Sequence[Cell]) -> None:
         # Others write, too
         self.files.invalidate_cache()
-        for experiment in {name for cell in cells for name in (cell.experiment, cell.models_of)}:
-            for path, info in self.files.find(f"{self.root}/{experiment}", detail=True).items():
-                folder = PurePosixPath(path.removeprefix(f"{self.root}/")).parts[:2]
-                self._objects.setdefault("/".join(folder), {})[path] = info
+        experiments = {name for cell in cells for name in (cell.experiment, cell.models_of)}
+        folders = [_folder(cell) for cell in cells] if len(cells) <= FEW else sorted(experiments)
+        listings = [self.files.find(f"{self.root}/{folder}", detail=True) for folder in folders]
+        if len(cells) <= FEW:
+            # Beside the folders
+            listings += [self.files.find(f"{self.root}/{_result(cell)}", detail=True) for cell in cells]
+        seen: dict[str, Claims] = {}
+        for path, info in (item for listing in listings for item in listing.items()):
+            name = "/".join(PurePosixPath(path.removeprefix(f"{self.root}/")).parts[:2])
+            seen.setdefault(name, {})[path] = info
+        self._objects |= {name: {} for cell in cells for name in (_folder(cell), _result(cell))} | seen
 
     def is_finished(self, cell: Cell) -> bool:
         """Whether it has a result."""
-        return _result(cell) in self._objects
+        return bool(self._objects.get(_result(cell)))
 
     def is_claimed(self, cell: Cell) -> bool:
         """Whether the newest claim is renewed."""
-        claims = {path: info for path, info in self._objects_of(cell).items() if f"/{CLAIM}/" in path}
+        claims = claims_among({path: info for path, info in self._of(cell).items() if f"/{CLAIMS}/" in path})
         if not claims:
             return False
         newest = max(claims)
         if self._watch.is_alive(newest, claims[newest]):
             return True
-        self._void[cell.label] = newest
+        try:
+            content = self.files.cat_file(newest)
+            # It may have been renewed between that listing and this content
+            self.files.invalidate_cache()
+            claims = claims_among(self.files.find(newest.rpartition("/")[0], detail=True))
+        except Exception as error:  # each store has its own
+            _report(error)
+            return True
+        if max(claims) != newest or self._watch.is_alive(newest, claims[newest]):
+            return True
+        self._void[cell.label] = content
         return False
 
     def n_steps(self, cell: Cell) -> int:
         """Env steps before its latest checkpoint."""
-        folders = (PurePosixPath(path).parent for path in self._objects_of(cell))
+        folders = (PurePosixPath(path).parent for path in self._of(cell))
         return max((n_steps_at(folder) for folder in folders if folder.parent.name == CHECKPOINTS), default=0)
 
-    def run(self, cell: Cell) -> bool:
-        """:func:`sb3_htr.experiments.runner.run_cell` on a copy."""
-        claim = Claim(self.files, f"{self.root}/{_folder(cell)}/{CLAIM}")
-        if not claim.take(self._void.get(cell.label)):
-            return False
-        try:
-            with _Every(RENEW, claim.renew), TemporaryDirectory(prefix="sb3-htr-") as runs:
-                return self._run(cell, claim, Path(runs))
-        finally:
-            claim.release()
-
-    def _run(self, cell: Cell, claim: Claim, here: Path) -> bool:
-        copy = WorkingCopy(self.files, f"{self.root}/{_folder(cell)}", cell.run_folder(here))
-        copy.fetch()
-        if is_there := self.files.exists(f"{self.root}/{_result(cell)}"):
-            self._fetch([cell], here)
-        try:
-            with _Every(SEND, lambda: copy.send() if claim.is_ours() else None):
-                has_result = run_cell(cell, here)
-        finally:
-            # Whoever took it over goes on from what was sent before
-            if is_ours := claim.is_ours():
-                copy.send()
-        if is_ours and not is_there:
-            self._send(cell, here)
-        return is_ours and has_result
+    def call(self, cell: Cell) -> tuple[Any, ...]:
+        """See :func:`run_on_copy`."""
+        return run_on_copy, cell, self.url, self._void.get(cell.label)
 
     @cached_property
     def _here(self) -> TemporaryDirectory[str]:
@@ -127,13 +120,17 @@ class ObjectStorage:
         """
         A folder that is gone with this process.
 
-        :raises OSError: if the storage cannot be read
+        :raises OSError: if the store cannot be read
         """
         here = Path(self._here.name)
         try:
-            self.look(cells)
-            self._fetch([cell for cell in cells if self.is_finished(cell) and not cell.result(here).exists()], here)
-        except Exception as error:  # each storage has its own
+            self._look(cells)
+            missing = [cell for cell in cells if self.is_finished(cell) and not cell.result(here).exists()]
+            for cell in missing:
+                cell.result(here).parent.mkdir(parents=True, exist_ok=True)
+            # Many at once, where the store can
+            self.files.get([self._path(cell) for cell in missing], [str(cell.result(here)) for cell in missing])
+        except Exception as error:  # each store has its own
             raise OSError(f"{self.url} cannot be read: {last_line(error)}") from None
         return here
 
@@ -142,23 +139,55 @@ class ObjectStorage:
         here = Path(self._here.name)
         for cell in cells:
             if cell.result(here).exists() and not self.is_finished(cell):
-                self._send(cell, here)
+                self.files.put_file(str(cell.result(here)), self._path(cell))
 
-    def _objects_of(self, cell: Cell) -> dict[str, Any]:
+    def _of(self, cell: Cell) -> Claims:
         return self._objects.get(_folder(cell), {})
 
-    def _fetch(self, cells: Sequence[Cell], here: Path) -> None:
-        for cell in cells:
-            cell.result(here).parent.mkdir(parents=True, exist_ok=True)
-        # Many at once, where the storage can
-        self.files.get([f"{self.root}/{_result(cell)}" for cell in cells], [str(cell.result(here)) for cell in cells])
+    def _path(self, cell: Cell) -> str:
+        return f"{self.root}/{_result(cell)}"
 
-    def _send(self, cell: Cell, here: Path) -> None:
-        """Whole, where others look for it."""
-        path = f"{self.root}/{_result(cell)}"
-        self.files.makedirs(path.rpartition("/")[0], exist_ok=True)
-        self.files.put_file(str(cell.result(here)), f"{path}.part")
-        self.files.mv(f"{path}.part", path)
+
+def run_on_copy(cell: Cell, url: str, void: bytes | None = None) -> bool:
+    """
+    :func:`sb3_htr.experiments.runner.run_cell` on a copy of what the store has of the cell.
+
+    :param cell: what to run
+    :param url: of fsspec
+    :param void: content of a claim on it whose owner is gone
+    :return: whether there is a result; if not, another process runs the cell
+    """
+    files, root = _opened(url)
+    there, result = f"{root}/{_folder(cell)}", f"{root}/{_result(cell)}"
+    claim = Claim(files, f"{there}/{CLAIMS}")
+    try:
+        if not claim.take(void):
+            return False
+        with _Every(RENEW, claim.renew), TemporaryDirectory(prefix="sb3-htr-") as folder:
+            runs = Path(folder)
+            copy = WorkingCopy(files, there, cell.run_folder(runs), claim.is_ours)
+            copy.fetch()
+            if files.exists(result):
+                cell.result(runs).parent.mkdir(parents=True, exist_ok=True)
+                files.get_file(result, str(cell.result(runs)))
+
+            try:
+                with _Every(SEND, copy.send):
+                    has_result = run_cell(cell, runs)
+            except BaseException:
+                # Where it is tried again, it goes on from here
+                _unless_it_fails(copy.send)
+                raise
+            _patiently(copy.send)
+            if not _patiently(claim.is_ours):
+                # Taken for dead: whoever took it over goes on from what was sent before
+                return False
+            _patiently(lambda: files.put_file(str(cell.result(runs)), result))
+            # Its evaluations were kept until now
+            _unless_it_fails(copy.prune)
+            return has_result
+    finally:
+        _unless_it_fails(claim.release)
 
 
 class _Every(Thread):
@@ -175,18 +204,45 @@ class _Every(Thread):
 
     def run(self) -> None:
         while not self._ended.wait(self.seconds):
-            try:
-                self.call()
-            except Exception as error:
-                print(f"The storage was not reached, which is tried again: {last_line(error)}", file=sys.stderr)
+            _unless_it_fails(self.call)
 
-    def __enter__(self) -> "_Every":
+    def __enter__(self) -> None:
         self.start()
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self._ended.set()
         self.join()
+
+
+def _unless_it_fails(call: Callable[[], None]) -> None:
+    try:
+        call()
+    except Exception as error:  # each store has its own
+        _report(error)
+
+
+def _patiently(call: Callable[[], T]) -> T:
+    for seconds in PATIENCE:
+        try:
+            return call()
+        except Exception as error:  # each store has its own
+            _report(error)
+            time.sleep(seconds)
+    return call()
+
+
+def _report(error: Exception) -> None:
+    print(f"The store was not reached: {last_line(error)}", file=sys.stderr, flush=True)
+
+
+def _opened(url: str) -> tuple[AbstractFileSystem, str]:
+    try:
+        files, root = url_to_fs(url)
+    except (ValueError, ImportError) as error:
+        raise ValueError(f"{url} cannot be opened ({last_line(error)}): give a folder, or a URL of fsspec.") from None
+    if not root.strip("/"):
+        raise ValueError(f"{url} names no place in a store: give one, as in s3://bucket/runs.")
+    return files, root.rstrip("/")
 
 
 def _folder(cell: Cell) -> str:

@@ -1,12 +1,13 @@
-"""Where the runs of experiments are: a folder, or a storage of fsspec, that all nodes see."""
+"""Where the runs of experiments are: a folder, or an object store, that all nodes see."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.storage.folder import SharedFolder
-from sb3_htr.experiments.storage.objects import ObjectStorage
+from sb3_htr.experiments.storage.objects import ObjectStore
 
 
 class Storage(Protocol):
@@ -42,12 +43,11 @@ class Storage(Protocol):
         :return: env steps before its latest checkpoint
         """
 
-    def run(self, cell: Cell) -> bool:
+    def call(self, cell: Cell) -> tuple[Any, ...]:
         """
-        In whatever process an executor calls it.
-
         :param cell: of an experiment
-        :return: whether there is a result; if not, another process runs the cell
+        :return: what an executor is to call, a function and its arguments. It says whether there is a result; if not, another
+            process runs the cell
         """
 
     def fetch_results(self, cells: Sequence[Cell]) -> Path:
@@ -66,6 +66,13 @@ def storage_at(runs: str | Path) -> Storage:
     """
     :param runs: a folder, or a URL of fsspec, as ``s3://bucket/runs``
     :return: where the runs are
-    :raises ValueError: if no such URL can be opened here
+    :raises ValueError: if there can be none
     """
-    return ObjectStorage(runs) if isinstance(runs, str) and "://" in runs else SharedFolder(Path(runs))
+    # Windows has drives of one letter
+    if not re.match(r"[A-Za-z][\w.+-]+:", str(runs)):
+        return SharedFolder(Path(runs))
+    if "://" not in str(runs):
+        raise ValueError(
+            f"The folder of the runs is {str(runs)!r}: give a URL as text, with two slashes, as s3://bucket/runs."
+        )
+    return ObjectStore(str(runs))
