@@ -26,15 +26,24 @@ from sb3_htr.experiments.grid import BELIEF, EXPERIMENTS, TUNED_DENSE, Experimen
 
 HTR = (Variant("htr-ser"),)
 RIVALS = (*HTR, Variant("htr-hfr"), Variant("htr-hipi"))
-# Of HFR's ant: a goal is reached from further away
+# HFR's ant: a goal is reached from further away. TEN: with older contexts than by default, as once, docs/trials.md
 WIDE = {"goal_radius": 0.8}
+TEN = {"replay_buffer_kwargs": {"context_episodes": 10}}
+ANT_GOAL = tuple(
+    variant
+    for rival in RIVALS
+    for variant in (
+        Variant(rival.method, env_kwargs=WIDE),
+        Variant(rival.method, f"{rival.method}, contexts of ten", TEN, WIDE),
+    )
+)
 
 for name, env_id, n_timesteps, n_episodes, variants in (
     ("two_link_arm", "TwoLinkArm-v0", 200_000, 20, HTR),
     ("hidden_target_reacher", "HiddenTargetReacher-v0", 150_000, 20, HTR),
     # The families of HFR, with HFR and what it was compared with; and that of HyperX
     ("sparse_half_cheetah_velocity", "SparseHalfCheetahVelocity-v0", 1_000_000, 20, RIVALS),
-    ("ant_goal", "SparseAnt-v0", 600_000, 20, tuple(Variant(rival.method, env_kwargs=WIDE) for rival in RIVALS)),
+    ("ant_goal", "SparseAnt-v0", 600_000, 20, ANT_GOAL),
     ("four_corners", "FourCorners-v0", 150_000, 20, RIVALS),
     ("ant_goal_disc", "AntGoalDisc-v0", 600_000, 6, (Variant("htr-ser", settings={"ent_coef": 0.05}),)),
 ):

@@ -17,8 +17,8 @@ from sb3_htr.zoo.run.trust import import_packages
 EXAMPLE = """  sb3-htr experiment point_robot --jobs 2
   sb3-htr experiment rivals wheeled ant --ray auto --runs /shared/runs
                                                         all methods on three envs, five seeds each, on a Ray cluster
-  sb3-htr experiment rivals wheeled ant --with-results results
-                                                        the same, but for the runs that are in results/ already
+  sb3-htr experiment rivals --with-results results/rivals
+                                                        all but the runs that are in results/rivals already
   sb3-htr experiment ant --quick                        one seed, a tenth of the env steps: does it run?
   sb3-htr experiment ant --finished                     a table and pictures, of what has been run so far
   sb3-htr experiment mine --gym-packages my_method --with-results results/rivals

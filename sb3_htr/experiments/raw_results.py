@@ -10,7 +10,7 @@ import numpy as np
 
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.experiments.cell import REMOVE, Cell
+from sb3_htr.experiments.cell import REMOVE, Cell, KwArgs
 from sb3_htr.experiments.runner import LOGGED, hyperparams_of
 
 # Of the code that trained, and of that which evaluated
@@ -36,6 +36,22 @@ def load(cell: Cell, path: Path) -> dict[str, Any]:
     """
     cell.check_result(path)
     return load_arrays(path, needed(cell), f"It may be of another version. {REMOVE}")
+
+
+def differing(one: KwArgs, other: KwArgs) -> list[str]:
+    """
+    :param one: hyperparameters
+    :param other: likewise
+    :return: names of those that are not the same, of those within others as ``replay_buffer_kwargs.relabel_probability``
+    """
+    names: list[str] = []
+    for key in sorted({*one, *other}):
+        ours, theirs = one.get(key), other.get(key)
+        if isinstance(ours, dict) and isinstance(theirs, dict):
+            names += [f"{key}.{name}" for name in differing(ours, theirs)]
+        elif ours != theirs:
+            names.append(key)
+    return names
 
 
 def pack(results: Mapping[Cell, Path], folder: Path) -> None:
@@ -76,8 +92,7 @@ def unpack(folder: Path, cells: Sequence[Cell], runs: Path) -> int:
         if missing := sorted({"cell", "hyperparams", *needed(cell)} - set(raw)):
             raise ValueError(f"{what} lacks {missing}, which {cell.experiment} needs: {advice}")
         cell.check_facts(raw, what, advice)
-        theirs, own = json.loads(str(raw["hyperparams"])), hyperparams_of(cell)
-        if different := sorted(key for key in {*own, *theirs} if own.get(key) != theirs.get(key)):
+        if different := differing(json.loads(str(raw["hyperparams"])), hyperparams_of(cell)):
             raise ValueError(f"{what} was trained with other {different} than {cell.experiment} would: {advice}")
         found[cell] = raw
     if not found:

@@ -159,7 +159,7 @@ def check(results: dict[Cell, Path]) -> None:
         # Older ones do not say
         own = json.loads(str(raw_results.load(cell, path).get("hyperparams", "null")))
         first, theirs = trained_by.setdefault((cell.variant, str(cell.env_kwargs)), (path, own))
-        if own and theirs and (different := sorted(key for key in {*own, *theirs} if own.get(key) != theirs.get(key))):
+        if own and theirs and (different := raw_results.differing(own, theirs)):
             raise ValueError(
                 f"{path} was trained with other {different} than {first}: has a YAML file changed in between? Move one of the "
                 "two away with its run, or choose other --runs."

@@ -88,6 +88,10 @@ def test_runs_of_something_else_are_not_taken(published: Path) -> None:
         ({"hyperparams": None}, r"lacks \['hyperparams'\]"),
         # As where a YAML file has changed since
         ({"hyperparams": json.dumps({"gamma": 0.5})}, r"was trained with other \[.*'gamma'.*\] than theirs would: leave"),
+        (
+            {"hyperparams": json.dumps({"replay_buffer_kwargs": {"context_episodes": 7}})},
+            r"was trained with other \[.*'replay_buffer_kwargs.context_episodes'.*\] than theirs would: leave",
+        ),
     ],
 )
 def test_runs_must_say_what_they_are_of(changed: dict[str, str | None], message: str, published: Path) -> None:
