@@ -34,7 +34,7 @@ ANT_GOAL = tuple(
     for rival in RIVALS
     for variant in (
         Variant(rival.method, env_kwargs=WIDE),
-        Variant(rival.method, f"{rival.method}, contexts of ten", TEN, WIDE),
+        Variant(rival.method, f"{rival.method}-ten", TEN, WIDE),
     )
 )
 
