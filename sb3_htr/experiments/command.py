@@ -64,7 +64,10 @@ def main(argv: Sequence[str]) -> None:
         except ValueError as error:
             # Experiments whose cells are all done have their results before it is raised
             failed = error
-    here = storage.fetch_results(chosen)
+    try:
+        here = storage.fetch_results(chosen)
+    except OSError as error:
+        raise failed or error from None
     results = {} if args.cell is not None else {name: finished(cells, here) for name, cells in grids.items()}
     for name, done in results.items():
         print(f"{len(done)} of {len(grids[name])} runs of {name} are finished.")

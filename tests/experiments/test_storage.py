@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -25,6 +26,7 @@ from hypothesis import strategies as st
 from helpers import ENV_ID
 from helpers.bucket import PROTOCOL, Bucket
 from helpers.results import made_up
+from sb3_htr.common.resume import n_steps_at
 from sb3_htr.experiments import driver as driver_module
 from sb3_htr.experiments import grid
 from sb3_htr.experiments.cell import Cell
@@ -45,7 +47,7 @@ TINY: dict[str, Any] = {
     "n_tasks_per_rollout": 4,
     "n_episodes_per_task": 3,
     "learning_starts": 240,
-    "gradient_steps": 4,
+    "gradient_steps": 2,
     "meta_batch_size": 4,
     "batch_size": 4,
     "policy_kwargs": {"net_arch": [8], "encoder_arch": [8]},
@@ -184,12 +186,14 @@ def test_who_is_silent_loses_a_claim_and_who_is_done_leaves_it(tmp_path: Path, m
 
 
 class Failing(Bucket):
-    """Goes away after so many files."""
+    """Goes away after so many files; as each comes, something happens."""
 
     cachable = False
     left = 0
+    meanwhile: Callable[[], None]
 
     def put_file(self, lpath: str, rpath: str, **_: Any) -> None:
+        self.meanwhile()
         self.left -= 1
         if self.left < 0:
             # As some say of what is there no more
@@ -197,31 +201,40 @@ class Failing(Bucket):
         super().put_file(lpath, rpath)
 
 
-@given(st.lists(st.tuples(st.booleans(), st.integers(0, 8)), max_size=8))
-def test_a_store_has_at_any_time_what_a_killed_run_leaves(rollouts: list[tuple[bool, int]]) -> None:
-    """However far a node came with sending: a checkpoint that is whole, and logs as new as it."""
-    files, sent = Failing(), 0
+@given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 8), st.integers(0, 2)), max_size=8))
+def test_a_store_has_at_any_time_what_a_killed_run_leaves(rollouts: list[tuple[int, int, int]]) -> None:
+    """However far a node came with sending, and training meanwhile: a checkpoint that is whole, and logs as new as it."""
+    files, now, sent = Failing(), 0, 0
     with TemporaryDirectory() as folder:
         here, there = Path(folder, "here"), str(Path(folder, "there"))
         copy = WorkingCopy(files, there, here, lambda: True)
-        for number, (saves, files.left) in enumerate(rollouts, start=1):
-            write(here / "progress.csv", "row\n" * number)
-            # One more is begun
-            write(here / "checkpoints" / ".9_steps.tmp" / "state.pt", "")
-            if saves:
-                write(here / "checkpoints" / f"{number}_steps" / "state.pt", str(number))
-                write(here / "checkpoints" / f"{number}_steps" / "manifest.json", str(number))
-                for old in sorted((here / "checkpoints").glob("?_steps"))[:-2]:
+
+        def train(n_checkpoints: int) -> None:
+            nonlocal now
+            for _ in range(n_checkpoints):
+                now += 1
+                write(here / "progress.csv", "row\n" * now)
+                for name in ("state.pt", "manifest.json"):
+                    write(here / "checkpoints" / f"{now}_steps" / name, str(now))
+                for old in sorted((here / "checkpoints").glob("*_steps"), key=n_steps_at)[:-2]:
                     shutil.rmtree(old)
-            with suppress(OSError):
+            # One more is begun
+            write(here / "checkpoints" / ".99_steps.tmp" / "state.pt", "")
+
+        for number, (n_before, files.left, n_meanwhile) in enumerate(rollouts):
+            train(n_before)
+            write(here / "progress.csv", "row\n" * now)
+            before = now
+            files.meanwhile = partial(train, n_meanwhile)
+            with suppress(FileNotFoundError):
                 copy.send()
-                sent = max([int(path.name[0]) for path in here.glob("checkpoints/?_steps")], default=0)
-                assert len(list(Path(there).glob("checkpoints/?_steps/*"))) == 2 * min(sum(s for s, _ in rollouts[:number]), 2)
+                sent = before
+                assert len(list(Path(there).glob("checkpoints/*/*"))) == (2 if before else 0), "older ones are removed"
             fetched = Path(folder, str(number))
             WorkingCopy(files, there, fetched, lambda: True).fetch()
-            whole = [path.name for path in fetched.glob("checkpoints/*") if len(list(path.iterdir())) == 2]
-            latest = max((int(name[0]) for name in whole), default=0)
+            latest = max(map(n_steps_at, fetched.glob("checkpoints/*")), default=0)
             assert latest >= sent and not list(fetched.rglob(".*"))
+            assert all(len(list(path.iterdir())) == 2 for path in fetched.glob("checkpoints/*")), "each can be gone on from"
             assert not latest or len((fetched / "progress.csv").read_text().split()) >= latest
 
 
@@ -234,7 +247,8 @@ def test_several_drivers_share_the_cells_and_none_runs_twice(
     url: str, trains: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def work(cell: Cell, folder: Path) -> None:
-        write(folder / "htr-ser/run_1/checkpoints/500_steps/state.pt", "half")
+        for name in ("state.pt", "manifest.json"):
+            write(folder / "htr-ser/run_1/checkpoints/500_steps" / name, "half")
         if cell.name == CELLS[0].name and trained.count(cell.name) == 1:
             raise RuntimeError("no luck")
         time.sleep(0.05)
@@ -256,11 +270,11 @@ def test_several_drivers_share_the_cells_and_none_runs_twice(
 
 
 def test_a_node_at_work_is_not_taken_for_dead(url: str, trains: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(claim_module, "VOID", 0.5)
+    monkeypatch.setattr(claim_module, "VOID", 1.5)
     store, cell = ObjectStore(url), CELLS[0]
 
     def work(cell: Cell, folder: Path) -> None:
-        for _ in range(15):
+        for _ in range(30):
             time.sleep(0.1)
             store.look([cell])
             assert store.is_claimed(cell)
@@ -295,13 +309,13 @@ def test_one_that_was_taken_for_dead_sends_nothing(url: str, trains: Any) -> Non
 
 def test_a_killed_node_costs_what_it_had_not_sent(tmp_path: Path, url: str) -> None:
     """The result is that of a run that nobody disturbed."""
-    (cell,) = Experiment("one", "", ENV_ID, 2400, (TINY_RUN,), 1, 480, by(("prior",))).cells()
+    (cell,) = Experiment("one", "", ENV_ID, 4_800, (TINY_RUN,), 1, 480, by(("prior",))).cells()
     pickled = tmp_path / "cell"
     pickled.write_bytes(pickle.dumps(cell))
     paths = os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])
     node = subprocess.Popen([sys.executable, "-c", NODE, url, str(pickled)], env={**os.environ, "PYTHONPATH": paths})
     store = ObjectStore(url)
-    while not 0 < store.n_steps(cell) < 2000:
+    while not 0 < store.n_steps(cell) < 4_000:
         assert node.poll() is None
         store.look([cell])
     node.send_signal(signal.SIGKILL)
@@ -354,8 +368,9 @@ def test_evaluations_are_kept_until_the_result_is_there(url: str, trains: Any, m
     def work(cell: Cell, folder: Path) -> None:
         kept = folder / "htr-ser/run_1/evaluated/belief.npz"
         assert kept.exists() == (len(trained) > 1)
-        write(kept, "")
-        time.sleep(0.2)
+        write(kept, str(len(trained)))
+        while not list(Path(url.removeprefix(f"{PROTOCOL}://")).rglob(kept.name)):
+            time.sleep(0.02)
         shutil.rmtree(kept.parent)
 
     monkeypatch.setattr(objects, "SEND", 0.05)

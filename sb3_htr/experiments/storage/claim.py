@@ -11,10 +11,10 @@ from fsspec import AbstractFileSystem
 RENEW, VOID = 20.0, 180.0
 FREE = b"free"
 
-Claims = dict[str, dict[str, Any]]
+Objects = dict[str, dict[str, Any]]
 
 
-def claims_among(objects: Claims) -> Claims:
+def claims_among(objects: Objects) -> Objects:
     """
     :param objects: paths, and what the store says of them
     :return: those that are claims
@@ -40,9 +40,12 @@ class Claim:
         :param void: content of a claim whose owner is gone; one that was renewed since has another
         :return: whether it is ours now
         """
+        if self._path and self.is_ours():
+            # Taken before, where the answer was lost
+            return True
         claims = self._claims()
         newest = max(claims, default=None)
-        if newest is not None and self.files.cat_file(newest) not in (FREE, void):
+        if newest is not None and self._content_of(newest) not in (FREE, void):
             return False
         # A number is never used again, so that whoever comes back sees that it was taken for dead
         self._path = f"{self.folder}/{int(newest.rpartition('/')[2]) + 1 if newest else 0:08}"
@@ -65,7 +68,7 @@ class Claim:
         :return: whether nobody took it over
         """
         newest = max(self._claims(), default=None)
-        return newest == self._path and self.files.cat_file(newest).startswith(self._token.encode())
+        return newest == self._path and self._content_of(newest).startswith(self._token.encode())
 
     def renew(self) -> None:
         """Show that its owner lives."""
@@ -78,10 +81,17 @@ class Claim:
         if self.is_ours():
             self.files.pipe_file(self._path, FREE)
 
-    def _claims(self) -> Claims:
+    def _claims(self) -> Objects:
         # Others write, too
         self.files.invalidate_cache()
         return claims_among(self.files.find(self.folder, detail=True))
+
+    def _content_of(self, path: str) -> bytes:
+        try:
+            return bytes(self.files.cat_file(path))
+        except FileNotFoundError:
+            # Another claim took its place
+            return b""
 
     def _content(self) -> bytes:
         return f"{self._token} {self._count}".encode()

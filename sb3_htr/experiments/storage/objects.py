@@ -2,7 +2,8 @@
 
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
@@ -13,11 +14,12 @@ from typing import Any, TypeVar
 from fsspec import AbstractFileSystem
 from fsspec.core import url_to_fs
 
+from sb3_htr.common.checkpoint import MANIFEST
 from sb3_htr.common.errors import last_line
 from sb3_htr.common.resume import CHECKPOINTS, n_steps_at
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.runner import run_cell
-from sb3_htr.experiments.storage.claim import RENEW, Claim, Claims, Watch, claims_among
+from sb3_htr.experiments.storage.claim import RENEW, Claim, Objects, Watch, claims_among
 from sb3_htr.experiments.storage.working_copy import WorkingCopy
 
 T = TypeVar("T")
@@ -43,7 +45,7 @@ class ObjectStore:
         self.files, self.root = _opened(url)
         self._watch = Watch()
         self._void: dict[str, bytes] = {}
-        self._objects: dict[str, Claims] = {}
+        self._objects: dict[str, Objects] = {}
 
     def __str__(self) -> str:
         return self.url
@@ -61,22 +63,35 @@ class ObjectStore:
 
     def look(self, cells: Sequence[Cell]) -> None:
         """If the store is out of reach, what was seen before holds until the next look."""
-        _unless_it_fails(lambda: self._look(cells))
+        _unless_it_fails(lambda: _patiently(lambda: self._look(cells)))
 
     def _look(self, cells: Sequence[Cell]) -> None:
-        # Others write, too
-        self.files.invalidate_cache()
-        experiments = {name for cell in cells for name in (cell.experiment, cell.models_of)}
-        folders = [_folder(cell) for cell in cells] if len(cells) <= FEW else sorted(experiments)
-        listings = [self.files.find(f"{self.root}/{folder}", detail=True) for folder in folders]
-        if len(cells) <= FEW:
-            # Beside the folders
-            listings += [self.files.find(f"{self.root}/{_result(cell)}", detail=True) for cell in cells]
-        seen: dict[str, Claims] = {}
-        for path, info in (item for listing in listings for item in listing.items()):
+        folders = [*map(_folder, cells)]
+        if len(cells) > FEW:
+            folders = sorted({name for cell in cells for name in (cell.experiment, cell.models_of)})
+        objects: Objects = {}
+        with self._watched():
+            for folder in folders:
+                objects |= self.files.find(f"{self.root}/{folder}", detail=True)
+            if len(cells) <= FEW:
+                # Beside the folders
+                objects |= {path: {} for path in map(self._path, cells) if self.files.exists(path)}
+        seen: dict[str, Objects] = {name: {} for cell in cells for name in (_folder(cell), _result(cell))}
+        for path, info in objects.items():
             name = "/".join(PurePosixPath(path.removeprefix(f"{self.root}/")).parts[:2])
             seen.setdefault(name, {})[path] = info
-        self._objects |= {name: {} for cell in cells for name in (_folder(cell), _result(cell))} | seen
+        self._objects |= seen
+
+    @contextmanager
+    def _watched(self) -> Iterator[None]:
+        """For owners that are silent, only time counts in which the store is within reach from here."""
+        # Others write, too
+        self.files.invalidate_cache()
+        try:
+            yield
+        except Exception:
+            self._watch = Watch()
+            raise
 
     def is_finished(self, cell: Cell) -> bool:
         """Whether it has a result."""
@@ -91,22 +106,23 @@ class ObjectStore:
         if self._watch.is_alive(newest, claims[newest]):
             return True
         try:
-            content = self.files.cat_file(newest)
-            # It may have been renewed between that listing and this content
-            self.files.invalidate_cache()
-            claims = claims_among(self.files.find(newest.rpartition("/")[0], detail=True))
+            with self._watched():
+                content = self.files.cat_file(newest)
+                # It may have been renewed between that listing and this content
+                claims = claims_among(self.files.find(newest.rpartition("/")[0], detail=True))
         except Exception as error:  # each store has its own
             _report(error)
             return True
-        if max(claims) != newest or self._watch.is_alive(newest, claims[newest]):
+        if max(claims, default="") != newest or self._watch.is_alive(newest, claims[newest]):
             return True
         self._void[cell.label] = content
         return False
 
     def n_steps(self, cell: Cell) -> int:
         """Env steps before its latest checkpoint."""
-        folders = (PurePosixPath(path).parent for path in self._of(cell))
-        return max((n_steps_at(folder) for folder in folders if folder.parent.name == CHECKPOINTS), default=0)
+        paths = map(PurePosixPath, self._of(cell))
+        whole = (path.parent for path in paths if path.name == MANIFEST and path.parent.parent.name == CHECKPOINTS)
+        return max(map(n_steps_at, whole), default=0)
 
     def call(self, cell: Cell) -> tuple[Any, ...]:
         """See :func:`run_on_copy`."""
@@ -124,24 +140,32 @@ class ObjectStore:
         """
         here = Path(self._here.name)
         try:
-            self._look(cells)
+            _patiently(lambda: self._look(cells))
             missing = [cell for cell in cells if self.is_finished(cell) and not cell.result(here).exists()]
             for cell in missing:
                 cell.result(here).parent.mkdir(parents=True, exist_ok=True)
             # Many at once, where the store can
-            self.files.get([self._path(cell) for cell in missing], [str(cell.result(here)) for cell in missing])
+            paths = [self._path(cell) for cell in missing], [str(cell.result(here)) for cell in missing]
+            _patiently(lambda: self.files.get(*paths))
         except Exception as error:  # each store has its own
             raise OSError(f"{self.url} cannot be read: {last_line(error)}") from None
         return here
 
     def send_results(self, cells: Sequence[Cell]) -> None:
-        """Those that are not there."""
-        here = Path(self._here.name)
-        for cell in cells:
-            if cell.result(here).exists() and not self.is_finished(cell):
-                self.files.put_file(str(cell.result(here)), self._path(cell))
+        """
+        Those that are not there.
 
-    def _of(self, cell: Cell) -> Claims:
+        :raises OSError: if the store cannot be written to
+        """
+        here = Path(self._here.name)
+        try:
+            for cell in cells:
+                if cell.result(here).exists() and not self.is_finished(cell):
+                    self.files.put_file(str(cell.result(here)), self._path(cell))
+        except Exception as error:  # each store has its own
+            raise OSError(f"{self.url} cannot be written to: {last_line(error)}") from None
+
+    def _of(self, cell: Cell) -> Objects:
         return self._objects.get(_folder(cell), {})
 
     def _path(self, cell: Cell) -> str:
@@ -161,16 +185,15 @@ def run_on_copy(cell: Cell, url: str, void: bytes | None = None) -> bool:
     there, result = f"{root}/{_folder(cell)}", f"{root}/{_result(cell)}"
     claim = Claim(files, f"{there}/{CLAIMS}")
     try:
-        if not claim.take(void):
+        if not _patiently(lambda: claim.take(void)):
             return False
         with _Every(RENEW, claim.renew), TemporaryDirectory(prefix="sb3-htr-") as folder:
             runs = Path(folder)
             copy = WorkingCopy(files, there, cell.run_folder(runs), claim.is_ours)
-            copy.fetch()
-            if files.exists(result):
+            _patiently(copy.fetch)
+            if _patiently(lambda: files.exists(result)):
                 cell.result(runs).parent.mkdir(parents=True, exist_ok=True)
-                files.get_file(result, str(cell.result(runs)))
-
+                _patiently(lambda: files.get_file(result, str(cell.result(runs))))
             try:
                 with _Every(SEND, copy.send):
                     has_result = run_cell(cell, runs)

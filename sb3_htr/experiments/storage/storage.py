@@ -54,11 +54,13 @@ class Storage(Protocol):
         """
         :param cells: of experiments
         :return: folder of this machine that has the results of those that are finished
+        :raises OSError: if they cannot be read
         """
 
     def send_results(self, cells: Sequence[Cell]) -> None:
         """
         :param cells: of which the folder of :meth:`fetch_results` may have results that were not there
+        :raises OSError: if they cannot be written
         """
 
 

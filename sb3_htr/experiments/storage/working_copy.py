@@ -1,11 +1,18 @@
 """A folder of a store on the disk of the node that works on it."""
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
 
 from fsspec import AbstractFileSystem
 
-from sb3_htr.common.resume import CHECKPOINTS
+from sb3_htr.common.checkpoint import MANIFEST
+from sb3_htr.common.resume import CHECKPOINTS, checkpoints
+
+# Version of what is there, and was not fetched
+HALF = 0, 0
 
 
 class WorkingCopy:
@@ -21,12 +28,15 @@ class WorkingCopy:
         self._sent: dict[str, tuple[int, int]] = {}
 
     def fetch(self) -> None:
-        """What the store has, but for hidden files."""
-        for path in self.files.find(self.there):
-            name = path.removeprefix(f"{self.there}/")
-            if not _is_hidden(name):
+        """What the store has, but for hidden files, and checkpoints that did not arrive whole."""
+        names = {path.removeprefix(f"{self.there}/") for path in self.files.find(self.there)}
+        for name in names:
+            path = PurePosixPath(name)
+            if _is_of_checkpoint(name) and (path.parent / MANIFEST).as_posix() not in names:
+                self._sent[name] = HALF
+            elif not _is_hidden(name):
                 (self.here / name).parent.mkdir(parents=True, exist_ok=True)
-                self.files.get_file(path, str(self.here / name))
+                self.files.get_file(f"{self.there}/{name}", str(self.here / name))
                 self._sent[name] = _version(self.here / name)
 
     def send(self) -> None:
@@ -34,27 +44,54 @@ class WorkingCopy:
         What changed, so that the store has at any time what a killed run leaves: a checkpoint, and all else as new as it, or
         newer; an older checkpoint until the next one is whole.
         """
-        # Listed before anything is read: what is written in the meantime comes the next time
-        names = [path.relative_to(self.here).as_posix() for path in self.here.rglob("*") if path.is_file()]
-        for name in sorted(names, key=_is_of_checkpoint):
-            try:
-                version = _version(self.here / name)
-                if not _is_hidden(name) and self._sent.get(name) != version and self.is_ours():
-                    self.files.put_file(str(self.here / name), f"{self.there}/{name}")
-                    self._sent[name] = version
-            except FileNotFoundError:
-                # Removed since it was listed; or the store says so
-                if (self.here / name).exists():
-                    raise
-        self._remove(list(filter(_is_of_checkpoint, self._sent)))
+        with self._latest_checkpoints() as of_checkpoints:
+            for path in [Path(inside, name) for inside, _, names in os.walk(self.here) for name in names]:
+                name = path.relative_to(self.here).as_posix()
+                if not _is_hidden(name) and not _is_of_checkpoint(name):
+                    try:
+                        self._put(name, path)
+                    except FileNotFoundError:
+                        # Removed since it was listed; or the store says so
+                        if path.exists():
+                            raise
+            for name, path in of_checkpoints.items():
+                self._put(name, path)
+            if of_checkpoints:
+                self._remove([name for name in self._sent if _is_of_checkpoint(name) and name not in of_checkpoints])
 
     def prune(self) -> None:
         """Remove there all else that was sent and is here no more."""
-        self._remove(list(self._sent))
+        self._remove([name for name in self._sent if not (self.here / name).exists()])
+
+    @contextmanager
+    def _latest_checkpoints(self) -> Iterator[dict[str, Path]]:
+        """
+        Files of the latest one of each run, by their names there, with the manifest at the end. Training may remove it in the
+        meantime.
+        """
+        self.here.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(prefix=".sending-", dir=self.here) as folder:
+            held: dict[str, Path] = {}
+            # Unlike rglob, this takes it calmly that folders go
+            runs = [Path(run) for run, folders, _ in os.walk(self.here) if CHECKPOINTS in folders]
+            for checkpoint in [latest for run in runs for latest in checkpoints(run)[:1]]:
+                with suppress(FileNotFoundError):  # then there is a later one the next time
+                    files = sorted(checkpoint.iterdir(), key=lambda file: file.name == MANIFEST)
+                    links = {file: Path(folder, str(len(held) + i)) for i, file in enumerate(files)}
+                    for file, link in links.items():
+                        os.link(file, link)
+                    held |= {file.relative_to(self.here).as_posix(): link for file, link in links.items()}
+            yield held
+
+    def _put(self, name: str, path: Path) -> None:
+        version = _version(path)
+        if self._sent.get(name) != version and self.is_ours():
+            self.files.put_file(str(path), f"{self.there}/{name}")
+            self._sent[name] = version
 
     def _remove(self, names: list[str]) -> None:
         for name in names:
-            if not (self.here / name).exists() and self.is_ours():
+            if self.is_ours():
                 if self.files.exists(f"{self.there}/{name}"):
                     self.files.rm_file(f"{self.there}/{name}")
                 del self._sent[name]
