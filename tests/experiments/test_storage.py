@@ -285,6 +285,33 @@ def test_a_node_at_work_is_not_taken_for_dead(url: str, trains: Any, monkeypatch
     assert store.is_finished(cell) and not store.is_claimed(cell) and len(trained) == 1
 
 
+def test_silence_counts_while_the_store_is_within_reach(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its owner may be out of reach, too, and alive."""
+    monkeypatch.setattr(claim_module, "VOID", 0.5)
+    store, cell = ObjectStore(url), CELLS[0]
+    assert Claim(store.files, f"{store.root}/{cell.run_folder(Path()).as_posix()}/.claims").take()
+    store.look([cell])
+    assert store.is_claimed(cell)
+    with monkeypatch.context() as patch:
+        failing(patch, "find", 99)
+        time.sleep(0.6)
+        store.look([cell])
+    store.look([cell])
+    assert store.is_claimed(cell)
+    time.sleep(0.6)
+    store.look([cell])
+    assert not store.is_claimed(cell)
+
+
+@pytest.mark.parametrize(("method", "path"), [("pipe_file", ".claims"), ("find", "seed1"), ("exists", "seed1.npz")])
+def test_a_store_that_is_out_of_reach_at_first_is_waited_for(
+    method: str, path: str, url: str, trains: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trained = trains(lambda cell, folder: None)
+    failing(monkeypatch, method, 2, path)
+    assert objects.run_on_copy(CELLS[0], url) and len(trained) == 1
+
+
 def test_one_that_was_taken_for_dead_sends_nothing(url: str, trains: Any) -> None:
     """Its cell goes on from what it had sent before."""
     (cell, *_), store = CELLS, ObjectStore(url)
