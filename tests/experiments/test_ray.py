@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 import torch as th
 
+from helpers.runs import OF_CELL
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.driver import Driver
 from sb3_htr.experiments.executors import Here, Ray
@@ -21,16 +22,7 @@ from sb3_htr.experiments.grid import Experiment, Variant, by
 from sb3_htr.experiments.runner import find_finished, run_cell
 from sb3_htr.zoo.run.agents import RECORD
 
-SMALL: dict[str, Any] = {
-    "n_envs": 4,
-    "n_tasks_per_rollout": 4,
-    "n_episodes_per_task": 3,
-    "learning_starts": 240,
-    "gradient_steps": 20,
-    "meta_batch_size": 4,
-    "batch_size": 4,
-    "policy_kwargs": {"net_arch": [8], "encoder_arch": [8]},
-}
+SLOWER = {**OF_CELL, "gradient_steps": 20}
 
 
 @pytest.mark.parametrize(("device", "n_gpus"), [("cpu", 0), ("cuda", 0.2)])
@@ -93,7 +85,7 @@ def workers() -> list[int]:
 def test_a_worker_and_a_node_that_are_killed_cost_no_cell(cluster: Any, tmp_path: Path) -> None:
     """Each cell has one result, and the weights of a run that nobody disturbed."""
     evaluations = by(("prior",))
-    variant = Variant("htr-ser", "tiny", SMALL, {"n_test_tasks": 4})
+    variant = Variant("htr-ser", "tiny", SLOWER, {"n_test_tasks": 4})
     cells = Experiment("grid", "", "SparsePointRobot-v0", 6000, (variant,), 4, 2000, evaluations).cells()
     node = cluster.add_node(num_cpus=1)
     runs, undisturbed = tmp_path / "runs", tmp_path / "undisturbed"

@@ -15,6 +15,7 @@ import yaml
 
 from helpers import ENV_ID
 from helpers.results import made_up
+from helpers.runs import OF_CELL
 from sb3_htr import PEARL, evaluate_adaptation, make_task_vec_env
 from sb3_htr.adaptation.explorers import EXPLORERS, Prior
 from sb3_htr.common.checkpoint import write_checkpoint
@@ -32,17 +33,6 @@ from sb3_htr.zoo.commands import train
 from sb3_htr.zoo.run.agents import agent_at
 from sb3_htr.zoo.run.shipped import hyperparams_file
 
-SMALL: dict[str, Any] = {
-    "n_envs": 4,
-    "n_tasks_per_rollout": 4,
-    "n_episodes_per_task": 3,
-    "learning_starts": 240,
-    "gradient_steps": 2,
-    "meta_batch_size": 4,
-    "batch_size": 4,
-    "policy_kwargs": {"net_arch": [8], "encoder_arch": [8]},
-}
-
 
 @pytest.fixture(autouse=True)
 def fast(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -56,7 +46,7 @@ def refuse(*_: Any, **__: Any) -> None:
 
 
 def test_of_two_unfinished_runs_the_newer_one_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (cell,) = Experiment("one", "", ENV_ID, 1200, (Variant("htr-ser", "tiny", SMALL),), 1).cells()
+    (cell,) = Experiment("one", "", ENV_ID, 1200, (Variant("htr-ser", "tiny", OF_CELL),), 1).cells()
     runs = [cell.run_folder(tmp_path) / cell.method / f"{ENV_ID}_{number}" for number in (9, 10)]
     for run in runs:
         write_checkpoint(run / "checkpoints" / "400_steps", {})
@@ -73,7 +63,7 @@ def test_of_two_unfinished_runs_the_newer_one_goes_on(tmp_path: Path, monkeypatc
 
 
 def test_a_killed_run_goes_on_and_a_finished_one_is_tested(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    variant = Variant("htr-ser", "tiny", SMALL, {"n_test_tasks": 10})
+    variant = Variant("htr-ser", "tiny", OF_CELL, {"n_test_tasks": 10})
     evaluations = by(("belief", "prior"), {}, {"goal_distance": 0.3})
     experiment = Experiment("one", "", ENV_ID, 1200, (variant,), 1, 480, evaluations, n_episodes=5)
     (cell,) = experiment.cells()
@@ -113,13 +103,13 @@ def test_a_killed_run_goes_on_and_a_finished_one_is_tested(tmp_path: Path, monke
     ):
         find_finished(replace(others, seed=2), folder)
     with pytest.raises(ValueError, match=r"has batch_size 4, but .* needs 5"):
-        find_finished(replace(others, settings={**SMALL, "batch_size": 5}), folder)
+        find_finished(replace(others, settings={**OF_CELL, "batch_size": 5}), folder)
     assert find_finished(replace(others, n_timesteps=1200), tmp_path / "nowhere") is None
 
 
 def test_a_killed_evaluation_goes_on_after_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Unless the code is another one by then."""
-    variant = Variant("htr-ser", "tiny", SMALL, {"n_test_tasks": 4})
+    variant = Variant("htr-ser", "tiny", OF_CELL, {"n_test_tasks": 4})
     tests = by(("prior", "belief"), {}, {"goal_distance": 0.3})
     (cell,) = Experiment("one", "", ENV_ID, 480, (variant,), 1, 480, tests, n_episodes=3).cells()
     here, elsewhere = tmp_path / "here", tmp_path / "elsewhere"
@@ -150,7 +140,7 @@ def test_a_killed_evaluation_goes_on_after_what_it_has(tmp_path: Path, monkeypat
 
 def test_a_last_checkpoint_that_cannot_be_written_is_no_interrupt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The grid goes on with its other cells, and says why this one did not end."""
-    (cell,) = Experiment("one", "", ENV_ID, 960, (Variant("htr-ser", "", SMALL, {"n_test_tasks": 4}),), 1, 480).cells()
+    (cell,) = Experiment("one", "", ENV_ID, 960, (Variant("htr-ser", "", OF_CELL, {"n_test_tasks": 4}),), 1, 480).cells()
 
     def write_unless_last(folder: Path, state: dict[str, Any]) -> None:
         if state["model"]["counters"]["num_timesteps"] >= 960:
@@ -167,10 +157,10 @@ def test_the_command_repeats_an_experiment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """With `--quick`, one seed and a tenth of the env steps; each cell trains by its method, with its settings."""
-    settings = {**SMALL, "replay_buffer_kwargs": {"relabeller": {"cell_size": 0.3}}}
+    settings = {**OF_CELL, "replay_buffer_kwargs": {"relabeller": {"cell_size": 0.3}}}
     variants = (
         Variant("htr-ec", "coarse", settings, {"goal_distance": 0.5, "n_test_tasks": 4}),
-        Variant("pearl-sparse-prior", "", SMALL, {"n_test_tasks": 4}),
+        Variant("pearl-sparse-prior", "", OF_CELL, {"n_test_tasks": 4}),
     )
     experiment = Experiment("tiny", "Two tiny runs.", ENV_ID, 9600, variants, 1, 4800, by(("belief",)), n_episodes=3)
     monkeypatch.setitem(grid.EXPERIMENTS, "tiny", experiment)
@@ -195,11 +185,11 @@ def test_the_command_repeats_an_experiment(
 
 
 def test_results_of_other_settings_are_not_taken_for_those_of_a_cell(tmp_path: Path) -> None:
-    variant = Variant("htr-ser", "tiny", SMALL, {"n_test_tasks": 4})
+    variant = Variant("htr-ser", "tiny", OF_CELL, {"n_test_tasks": 4})
     (cell,) = Experiment("one", "", ENV_ID, 480, (variant,), 1, 480, by(("prior",)), n_episodes=2).cells()
     assert run_cell(cell, tmp_path)
     for other in (
-        replace(cell, settings={**SMALL, "gamma": 0.5}),
+        replace(cell, settings={**OF_CELL, "gamma": 0.5}),
         replace(cell, n_timesteps=960),
         replace(cell, n_episodes=3),
     ):
@@ -213,7 +203,7 @@ def test_results_of_other_settings_are_not_taken_for_those_of_a_cell(tmp_path: P
 
 
 def test_a_run_by_another_file_of_settings_is_not_that_of_a_cell(tmp_path: Path) -> None:
-    (cell,) = Experiment("one", "", ENV_ID, 480, (Variant("htr-ser", "tiny", SMALL),), 1, 480, by(("prior",))).cells()
+    (cell,) = Experiment("one", "", ENV_ID, 480, (Variant("htr-ser", "tiny", OF_CELL),), 1, 480, by(("prior",))).cells()
     blocks = yaml.safe_load(hyperparams_file("pearl.yml").read_text())
     (tmp_path / "mine.yml").write_text(yaml.safe_dump({"default": {**blocks["default"], "kl_coef": 7.0}}))
     assert main([*["train", *cell.training(cell.run_folder(tmp_path))], "-conf", str(tmp_path / "mine.yml")]) == 0
@@ -223,7 +213,7 @@ def test_a_run_by_another_file_of_settings_is_not_that_of_a_cell(tmp_path: Path)
 
 def test_a_training_that_was_interrupted_in_its_last_updates_is_not_finished(tmp_path: Path) -> None:
     """It leaves a model of as many env steps as were planned."""
-    (cell,) = Experiment("one", "", ENV_ID, 480, (Variant("htr-ser", "tiny", SMALL),), 1, 480, by(("prior",))).cells()
+    (cell,) = Experiment("one", "", ENV_ID, 480, (Variant("htr-ser", "tiny", OF_CELL),), 1, 480, by(("prior",))).cells()
     folder = cell.run_folder(tmp_path)
     assert main(["train", *cell.training(folder)]) == 0
     run, _ = find_finished(cell, folder) or pytest.fail("there is one")
@@ -235,7 +225,7 @@ def test_a_training_that_was_interrupted_in_its_last_updates_is_not_finished(tmp
 def test_explorers_and_episodes_are_those_of_the_experiment(tmp_path: Path) -> None:
     """Of the training, its evaluations, and the final model's."""
     explorer = {"name": "prior", "n_exploration_episodes": 2}
-    variant = Variant("pearl-sparse-prior", "", {**SMALL, "explorer": explorer}, {"n_test_tasks": 4, "goal_distance": 0.3})
+    variant = Variant("pearl-sparse-prior", "", {**OF_CELL, "explorer": explorer}, {"n_test_tasks": 4, "goal_distance": 0.3})
     experiment = Experiment("few", "", ENV_ID, 480, (variant,), 1, 480, by(("prior", "aggregate")), n_episodes=3)
     (cell,) = experiment.cells()
     assert run_cell(cell, tmp_path)
@@ -260,7 +250,7 @@ def test_plain_settings_of_a_variant_reach_its_evaluation(tmp_path: Path) -> Non
     trial["policy_kwargs"] = {"lstm_hidden_size": 4, "net_arch": [4], "log_std_init": -0.5}
     of_sac = {"n_envs": 4, "gradient_steps": 1, "policy_kwargs": {"net_arch": [4]}}
     variants = (
-        Variant("htr-ser", "critics", {**SMALL, "policy_kwargs": networks}, kwargs),
+        Variant("htr-ser", "critics", {**OF_CELL, "policy_kwargs": networks}, kwargs),
         Variant("rl2", "trials", trial, kwargs),
         Variant("sac-her", "told", of_sac, kwargs),
     )
@@ -284,7 +274,7 @@ def test_explorers_that_could_not_be_evaluated_are_not_trained_with(tmp_path: Pa
 
 def test_the_code_that_evaluated_is_that_of_the_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever was committed since it began."""
-    (cell,) = Experiment("one", "", ENV_ID, 480, (Variant("htr-ser", "", SMALL, {"n_test_tasks": 4}),), 1, 480).cells()
+    (cell,) = Experiment("one", "", ENV_ID, 480, (Variant("htr-ser", "", OF_CELL, {"n_test_tasks": 4}),), 1, 480).cells()
     monkeypatch.setattr("sb3_htr.common.versions.commit", lambda: {"commit": "later", "dirty": False})
     monkeypatch.setattr("sb3_htr.experiments.runner.commit", lambda: {"commit": "later", "dirty": False}, raising=False)
     assert run_cell(cell, tmp_path)

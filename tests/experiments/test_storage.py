@@ -26,6 +26,7 @@ from hypothesis import strategies as st
 from helpers import ENV_ID
 from helpers.bucket import PROTOCOL, Bucket
 from helpers.results import made_up
+from helpers.runs import OF_CELL
 from sb3_htr.common.resume import n_steps_at
 from sb3_htr.experiments import driver as driver_module
 from sb3_htr.experiments import grid
@@ -42,17 +43,7 @@ from sb3_htr.experiments.storage.working_copy import WorkingCopy
 from sb3_htr.zoo.cli import main
 
 CELLS = Experiment("toy", "", ENV_ID, 1000, (Variant("htr-ser"), Variant("htr-ec")), 3).cells()
-TINY: dict[str, Any] = {
-    "n_envs": 4,
-    "n_tasks_per_rollout": 4,
-    "n_episodes_per_task": 3,
-    "learning_starts": 240,
-    "gradient_steps": 2,
-    "meta_batch_size": 4,
-    "batch_size": 4,
-    "policy_kwargs": {"net_arch": [8], "encoder_arch": [8]},
-}
-TINY_RUN = Variant("htr-ser", "tiny", TINY, {"n_test_tasks": 4})
+TINY_RUN = Variant("htr-ser", "tiny", OF_CELL, {"n_test_tasks": 4})
 # A node that runs a cell, with a checkpoint after each rollout, and sends all the time
 NODE = """
 import pickle, sys

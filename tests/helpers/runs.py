@@ -20,6 +20,17 @@ SMALL = [
     "n_envs:4",
     "policy_kwargs:{'net_arch':[16],'encoder_arch':[16]}",
 ]
+# Of a cell of an experiment, likewise
+OF_CELL: dict[str, Any] = {
+    "n_envs": 4,
+    "n_tasks_per_rollout": 4,
+    "n_episodes_per_task": 3,
+    "learning_starts": 240,
+    "gradient_steps": 2,
+    "meta_batch_size": 4,
+    "batch_size": 4,
+    "policy_kwargs": {"net_arch": [8], "encoder_arch": [8]},
+}
 METHOD = "htr-ser"
 SHIPPED = shipped("trained_agents") / METHOD / f"{ENV_ID}.zip"
 # Finds no agent there, so that the shipped one is taken
