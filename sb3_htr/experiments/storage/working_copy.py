@@ -70,7 +70,8 @@ class WorkingCopy:
         meantime.
         """
         self.here.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(prefix=".sending-", dir=self.here) as folder:
+        # Beside it: who lists it must not see a folder come and go
+        with TemporaryDirectory(prefix=".sending-", dir=self.here.parent) as folder:
             held: dict[str, Path] = {}
             # Unlike rglob, this takes it calmly that folders go
             runs = [Path(run) for run, folders, _ in os.walk(self.here) if CHECKPOINTS in folders]
