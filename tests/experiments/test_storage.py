@@ -433,6 +433,7 @@ def test_what_is_neither_folder_nor_store_is_refused(runs: str | Path, message: 
     """A local folder of that name would be on one node alone."""
     with pytest.raises(ValueError, match=message):
         storage_at(runs)
+    assert str(storage_at("runs:1")) == str(Path("runs:1").resolve()), "a folder's name may have a colon"
 
 
 def test_a_store_that_cannot_be_used_is_said_before_anything_is_run(

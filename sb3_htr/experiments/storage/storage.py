@@ -70,11 +70,11 @@ def storage_at(runs: str | Path) -> Storage:
     :return: where the runs are
     :raises ValueError: if there can be none
     """
+    if "://" in str(runs):
+        return ObjectStore(str(runs))
     # Windows has drives of one letter
-    if not re.match(r"[A-Za-z][\w.+-]+:", str(runs)):
-        return SharedFolder(Path(runs))
-    if "://" not in str(runs):
+    if re.match(r"[A-Za-z][\w.+-]+:/", str(runs)):
         raise ValueError(
             f"The folder of the runs is {str(runs)!r}: give a URL as text, with two slashes, as s3://bucket/runs."
         )
-    return ObjectStore(str(runs))
+    return SharedFolder(Path(runs))
