@@ -27,6 +27,7 @@ from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run import model_card
 from sb3_htr.zoo.run.agents import RECORD, agent_at, agent_for
 from sb3_htr.zoo.run.shipped import shipped
+from sb3_htr.zoo.run.train_arguments import training_facts
 
 
 @pytest.fixture
@@ -260,6 +261,14 @@ def test_the_command_of_a_record_is_that_of_any_machine(defaults: list[str]) -> 
     command = model_card.training_command({"arguments": arguments, "seed": 4, "method": "htr-ec"})
     params = "-params 'policy_kwargs:{'\"'\"'latent_dim'\"'\"': 3}'"
     assert command == f"sb3-htr train -i agent.zip --env {ENV_ID} {params} --method htr-ec --seed 4"
+
+
+def test_joined_arguments_keep_folders_to_themselves() -> None:
+    """rl_zoo3 takes an option and its value in one word, too."""
+    arguments = [f"--env={ENV_ID}", "-f/home/me/runs", "-tb/home/me/tb", "-i/home/me/agent.zip", "--conf-file=/home/me/my.yml"]
+    command = model_card.training_command({"arguments": [*arguments, "--seed=3"], "seed": 4, "method": "htr-ec"})
+    assert command == f"sb3-htr train --env {ENV_ID} -i agent.zip --method htr-ec --seed 4"
+    assert training_facts({}, arguments) == training_facts({}, ["-i", "/home/me/agent.zip"])
 
 
 def test_a_record_may_end_with_an_option() -> None:

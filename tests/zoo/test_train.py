@@ -264,6 +264,9 @@ def test_help_and_mistakes(capsys: pytest.CaptureFixture[str], tmp_path: Path) -
         output = capsys.readouterr().out
         assert output.startswith(f"sb3-htr {command}: ") and f"usage: sb3-htr {command} " in output
         assert f"sb3-htr {other}: " not in output and "--algo {pearl}" in output
+    with pytest.raises(SystemExit):
+        main(["train", "--env", ENV_ID, "--see", "9"])
+    assert "unrecognized arguments: --see 9" in capsys.readouterr().err
     with pytest.raises(ValueError, match="--algo is 'sac', but sb3-htr trains pearl"):
         main(["train", "--env", ENV_ID, "--algo", "sac"])
     with pytest.raises(FileNotFoundError, match="There is no run in"):

@@ -20,8 +20,8 @@ from sb3_htr.zoo.plots.adaptation import plot_adaptation_curve, plot_adaptation_
 from sb3_htr.zoo.plots.curves import Curve, plot_curves
 from sb3_htr.zoo.plots.latent import plot_latent_space
 from sb3_htr.zoo.run.agents import RECORD, TrainedAgent, runs_with_models
-from sb3_htr.zoo.run.defaults import training_facts
 from sb3_htr.zoo.run.time_to_learned import time_to_learned
+from sb3_htr.zoo.run.train_arguments import training_facts
 
 EXAMPLE = """  sb3-htr plot --env SparsePointRobot-v0                  an agent that comes with the package
   sb3-htr plot runs/htr runs/sparse -l HTR "no relabelling"    the runs in a folder are the seeds of its curve

@@ -13,15 +13,13 @@ import gymnasium as gym
 from htr_envs.goal_env import NAMESPACE, find_hidden
 from sb3_htr.common.resume import n_steps_done
 from sb3_htr.zoo.run.agents import OF_TRAINING, RECORD, find_run, is_finished, n_steps_of, read_record
-from sb3_htr.zoo.run.defaults import default_arguments, given_arguments, value_of
 from sb3_htr.zoo.run.malloc import keep_freed_memory
 from sb3_htr.zoo.run.manager import run_rl_zoo
 from sb3_htr.zoo.run.method import DEFAULT, get_method, methods
 from sb3_htr.zoo.run.storage import absolute
+from sb3_htr.zoo.run.train_arguments import default_arguments, given_arguments, spelled_out, value_of
 from sb3_htr.zoo.run.trust import CONF, WEIGHTS, check_arguments, import_packages, see_working_folder
 
-# Options with a path behind "="
-PATHS_EQUAL = ("--conf-file=", "--tensorboard-log=", "--storage=", "--trained-agent=")
 OWN_ENV = "An env of your own is found once its module is imported, by --gym-packages MODULE."
 HELP = """sb3-htr train: rl_zoo3's train (its arguments follow) with evaluations that adapt to validation tasks.
 
@@ -105,7 +103,7 @@ def main(argv: Sequence[str]) -> None:
             raise ValueError("--env is missing: give the id of a task env, as in `sb3-htr train --env SparsePointRobot-v0`.")
         see_working_folder()  # for what -params and -conf name
         packages = ["--gym-packages", *args.gym_packages] if args.gym_packages else []
-        given = [*env, *_from_anywhere(rest), *packages]
+        given = [*env, *_from_anywhere(spelled_out(rest)), *packages]
         try:
             find_hidden(args.env or "")
         except gym.error.UnregisteredEnv as error:
@@ -129,7 +127,7 @@ def main(argv: Sequence[str]) -> None:
 
 def _from_anywhere(arguments: Sequence[str]) -> list[str]:
     """The same with whole paths, as a run may go on from another folder."""
-    words = [part for word in arguments for part in (word.split("=", 1) if word.startswith(PATHS_EQUAL) else [word])]
+    words = list(arguments)
     for i, (option, word) in enumerate(pairwise(words), start=1):
         if option in ("-tb", "--tensorboard-log", *WEIGHTS) or (option in CONF and Path(word).is_file()):
             words[i] = str(Path(word).resolve())

@@ -1,5 +1,6 @@
 """rl_zoo3's experiment manager, for runs of task envs."""
 
+import argparse
 import contextlib
 import importlib
 import json
@@ -17,7 +18,7 @@ from functools import partial
 from io import StringIO
 from pathlib import Path
 from pprint import pprint
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any, cast
 
 import optuna
@@ -49,12 +50,12 @@ from sb3_htr.pearl.untrusted import load_untrusted
 from sb3_htr.zoo.run.agents import RECORD, read_record
 from sb3_htr.zoo.run.algorithm import Algorithm
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback, ProgressCallback
-from sb3_htr.zoo.run.defaults import given_arguments
 from sb3_htr.zoo.run.folder import SystemLock, claim, lock
 from sb3_htr.zoo.run.kinds import checked_kinds
 from sb3_htr.zoo.run.method import DEFAULT, get_method, merged, names_of
 from sb3_htr.zoo.run.shipped import find_hyperparams
 from sb3_htr.zoo.run.storage import check_is_there, opened
+from sb3_htr.zoo.run.train_arguments import given_arguments
 from sb3_htr.zoo.run.trust import PACKAGES, check_arguments, plain_settings, refuse
 
 # What a YAML file may have beside the arguments of the algorithm
@@ -522,7 +523,12 @@ def run_rl_zoo(
             "CheckpointCallback": CheckpointCallback,
             "ProgressBarCallback": MetaProgressBarCallback,
         },
-        rl_zoo3.train: {"ExperimentManager": manager, "ALGOS": {algorithm.name: algorithm.model_class()}},
+        rl_zoo3.train: {
+            "ExperimentManager": manager,
+            "ALGOS": {algorithm.name: algorithm.model_class()},
+            # Records are read by full names
+            "argparse": SimpleNamespace(ArgumentParser=partial(argparse.ArgumentParser, allow_abbrev=False)),
+        },
     }
     theirs = {module: {name: vars(module)[name] for name in ours} for module, ours in replaced.items()}
     before, sys.argv = sys.argv, [program, *arguments]

@@ -9,10 +9,10 @@ from huggingface_hub import EvalResult, ModelCardData
 
 from sb3_htr.adaptation.evaluation import AdaptationRecord
 from sb3_htr.zoo.run.algorithm import Algorithm
-from sb3_htr.zoo.run.defaults import given_arguments
 from sb3_htr.zoo.run.hub import model_name
 from sb3_htr.zoo.run.method import DEFAULT, PEARLMethod, get_method, methods
 from sb3_htr.zoo.run.shipped import hyperparams_file
+from sb3_htr.zoo.run.train_arguments import given_arguments
 from sb3_htr.zoo.run.trust import CONF, PACKAGES, WEIGHTS
 
 TAGS = (
@@ -44,15 +44,14 @@ def training_command(record: dict[str, Any]) -> str:
     words: list[str] = []
     while arguments:
         word = arguments.pop(0)
-        option, equals, value = word.partition("=")
-        if option in LOCAL:
-            del arguments[: 0 if equals else LOCAL[option]]
-        elif option in (*CONF, *WEIGHTS):
+        if word in LOCAL:
+            del arguments[: LOCAL[word]]
+        elif word in (*CONF, *WEIGHTS):
             # Settings that come with the package are on any machine; of the weights that it began with, there is the name
-            file = Path(value if equals else "".join(arguments[:1]))
-            del arguments[: 0 if equals else 1]
-            if option in WEIGHTS or (file.parent.name in ("", "hyperparams") and hyperparams_file(file.name).is_file()):
-                words += [option, file.name]
+            file = Path("".join(arguments[:1]))
+            del arguments[:1]
+            if word in WEIGHTS or (file.parent.name in ("", "hyperparams") and hyperparams_file(file.name).is_file()):
+                words += [word, file.name]
         else:
             words.append(word)
     return shlex.join(["sb3-htr", "train", *words, "--seed", str(record["seed"])])

@@ -7,7 +7,7 @@ import ast
 import importlib
 import os
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +72,7 @@ def check_arguments(
     arguments: Sequence[str], packages: Sequence[str], file: object, trust: bool, named: Iterable[str] = ()
 ) -> None:
     """
-    :param arguments: of a training, from the record of a run
+    :param arguments: of a training, from the record of a run, spelled out
     :param packages: modules that the record asks for, see :func:`import_packages`
     :param file: the record, for messages
     :param trust: whether it may have code run
@@ -80,7 +80,7 @@ def check_arguments(
     :raises ValueError: if code would be run
     """
     option = ""
-    for word in () if trust else _one_by_one(arguments):
+    for word in () if trust else arguments:
         if word.startswith("-") and not word[1:2].isdecimal():
             option = word
             refused = word not in HARMLESS
@@ -113,18 +113,6 @@ def check_env_kwargs(env_kwargs: Any, file: object, named: Iterable[str] = ()) -
         module, colon, _ = env_kwargs.rpartition(":")
         if colon and module not in (*PACKAGES, *named):
             raise refuse(file, f"has {env_kwargs!r} among its settings")
-
-
-def _one_by_one(arguments: Sequence[str]) -> Iterator[str]:
-    """``--option=value`` and ``-nVALUE`` as two words."""
-    for word in arguments:
-        option, equals, value = word.partition("=")
-        if equals and option.startswith("--"):
-            yield from (option, value)
-        elif word[:2] in ("-n", "-f") and word not in HARMLESS:
-            yield from (word[:2], word[2:])
-        else:
-            yield word
 
 
 def _is_literal(text: str) -> bool:

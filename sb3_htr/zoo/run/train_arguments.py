@@ -1,6 +1,6 @@
 """The arguments of a training: what `sb3-htr train` puts in front of a user's for rl_zoo3's train, where later ones win."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import takewhile
 from typing import Any
 
@@ -9,6 +9,8 @@ from sb3_htr.zoo.run.trust import WEIGHTS
 
 # PEARL's reference adapts for as many episodes. One thread: two runs on two cores must not fight for them
 ALWAYS = {"--num-threads": "1", "--save-freq": "20000", "--eval-episodes": "20"}
+# Those of rl_zoo3 with one dash and one value, which may be in the same word
+SHORT = ("-n", "-f", "-i", "-tb")
 
 
 def default_arguments(algorithm: Algorithm) -> list[str]:
@@ -20,18 +22,35 @@ def default_arguments(algorithm: Algorithm) -> list[str]:
     return [word for option in options.items() for word in option]
 
 
+def spelled_out(arguments: Sequence[str]) -> list[str]:
+    """
+    :param arguments: as a user gave them
+    :return: the same, with options and values in words of their own, where they are ``--option=value`` or ``-nVALUE``
+    """
+
+    def parts(word: str) -> Iterator[str]:
+        option, equals, value = word.partition("=")
+        short = next((short for short in SHORT if word.startswith(short) and word != short), None)
+        if equals and option.startswith("--"):
+            yield from (option, value)
+        elif short is not None:
+            yield from (short, word.removeprefix(short))
+        else:
+            yield word
+
+    return [part for word in arguments for part in parts(word)]
+
+
 def value_of(arguments: Sequence[str], *options: str) -> str | None:
     """
-    :param arguments: of a run
+    :param arguments: of a run, :func:`spelled_out`
     :param options: all names of one
     :return: what it was given, of several values all; None if it was not
     """
     given = None
     for i, word in enumerate(arguments):
-        option, equals, value = word.partition("=")
-        if option in options:
-            behind = takewhile(lambda word: not word.startswith("-") or word[1:].isdigit(), arguments[i + 1 :])
-            given = value if equals else " ".join(behind)
+        if word in options:
+            given = " ".join(takewhile(lambda word: not word.startswith("-") or word[1:].isdigit(), arguments[i + 1 :]))
     return given
 
 
@@ -44,15 +63,15 @@ def training_facts(hyperparams: dict[str, Any], arguments: Sequence[str]) -> dic
     """
     defaults = [word for option in ALWAYS.items() for word in option]
     options = (("--eval-episodes",), ("--eval-freq",), ("--eval-env-kwargs",), WEIGHTS)
-    return {**hyperparams, **{names[0]: value_of([*defaults, *arguments], *names) for names in options}}
+    return {**hyperparams, **{names[0]: value_of([*defaults, *spelled_out(arguments)], *names) for names in options}}
 
 
 def given_arguments(arguments: Sequence[str]) -> list[str]:
     """
     :param arguments: of a run that was begun by this version, or by one with fewer defaults
-    :return: what the user gave
+    :return: what the user gave, :func:`spelled_out`
     """
-    given = list(arguments)
+    given = spelled_out(arguments)
     while given[:1] and given[0] in ("--algo", "-conf", *ALWAYS):
         del given[:2]
     return given
