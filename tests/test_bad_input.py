@@ -61,7 +61,7 @@ class WithoutHook(gym.Wrapper[Any, Any, Any, Any]):
         (lambda: WithoutTaskId(gym.make(ENV_ID)), r"reset returns no info\['task_id'\]"),
         (
             lambda: WithSpaces(gym.make(ENV_ID), observation_space=spaces.Dict({"x": spaces.Box(0, 1, (2,))})),
-            "The observation space is Dict.* but PEARL needs a Box of one axis",
+            "The observation space is Dict.*, expected a Box of one axis",
         ),
         (
             lambda: WithSpaces(gym.make(ENV_ID), action_space=spaces.Discrete(3)),
@@ -103,6 +103,8 @@ def test_an_unknown_id_is_gymnasiums_business(tiny_pearl: MakePEARL) -> None:
         ({"kl_coef": -0.1}, "kl_coef is -0.1, expected a number of at least 0"),
         ({"final_kl_coef": -0.1}, "final_kl_coef is -0.1, expected a number of at least 0"),
         ({"kl_coef": 0.0, "final_kl_coef": 0.1}, "kl_coef and final_kl_coef are a factor apart, so neither may be 0"),
+        ({"policy_kwargs": {"encoder_class": 3}}, r"encoder_class is 3, expected a class derived from torch\.nn"),
+        ({"policy_kwargs": {"encoder_class": th.nn.GRU}}, "encoder_class GRU has no empty, extend, posterior"),
         ({"policy_kwargs": {"encoder_class": "Mine"}}, r"encoder_class is 'Mine', expected one of \['ContextEncoder', 'Prior"),
         ({"gamma": 1.1}, "gamma is 1.1, expected a number from 0 to 1"),
         ({"tau": float("nan")}, "tau is nan"),

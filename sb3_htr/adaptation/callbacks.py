@@ -13,8 +13,9 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.evaluation import MetaLearner, first_success, record_adaptation, task_set
 from sb3_htr.adaptation.explorers import to_explorer
-from sb3_htr.common.atomic import WRITE_ERRORS, atomic_path, reason
+from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checks import get_task_family
+from sb3_htr.common.errors import WRITE_ERRORS, reason
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
 

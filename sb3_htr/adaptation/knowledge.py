@@ -44,8 +44,9 @@ class LatentKnowledge(nn.Module):
     """
     What explorers start from; saved with the model, not trained by gradients.
 
-    Two things are kept: the *aggregate*, mean and covariance of the posterior means of recent meta-batches, which are far from
-    N(0, I) while the KL term is weak; and :class:`Particles`.
+    Kept are the *aggregate*, mean and covariance of the posterior means of recent meta-batches, which are far from N(0, I)
+    while the KL term is weak; :class:`Particles`; the *threshold* above which a reward, less what is task-free of it, is a
+    success; and the *task-free value*, the discounted return of steps that never succeed.
 
     :param latent_dim: dimension of z
     """

@@ -3,26 +3,10 @@
 import errno
 import os
 import shutil
-import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from uuid import uuid4
-
-from sb3_htr.common.errors import last_line
-
-# What writing a file can end in: a full disk (of which torch makes a RuntimeError), a clock that zip files do not know
-WRITE_ERRORS = (OSError, RuntimeError, ValueError, struct.error)
-
-
-def reason(error: Exception) -> str:
-    """
-    :param error: of writing a file
-    :return: in a few words
-    """
-    if isinstance(error, RuntimeError):
-        return "torch could not write it, as on a full disk"
-    return (isinstance(error, OSError) and error.strerror) or last_line(error)
 
 
 @contextmanager

@@ -94,7 +94,7 @@ def check_spaces(env: GymEnv) -> None:
         ("action", env.action_space, "it has no discrete actions; flatten others with a wrapper."),
     ):
         if not isinstance(space, spaces.Box) or len(space.shape) != 1:
-            raise ValueError(f"The {name} space is {space}, but PEARL needs a Box of one axis: {advice}")
+            raise ValueError(f"The {name} space is {space}, expected a Box of one axis: {advice}")
     check_acts_in_floats(env.action_space)
     if not env.action_space.is_bounded():  # type: ignore[attr-defined]
         raise ValueError(f"The action space {env.action_space} has no bounds: give it some, and scale actions in the env.")

@@ -32,10 +32,8 @@ class ObservationNormalizer(nn.Module):
 
     def update(self, obs: np.ndarray) -> None:
         """
-        :param obs: (n, obs_dim), newly observed
+        :param obs: (n, obs_dim), newly observed, finite
         """
-        if not np.isfinite(obs).all():
-            return  # the replay buffer says so, and the statistics stay as they are
         moments = RunningMeanStd(shape=self.mean.shape)
         moments.mean, moments.var = self.mean.cpu().numpy(), self.variance.cpu().numpy()
         moments.count = self.count.item()

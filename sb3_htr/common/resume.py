@@ -14,9 +14,10 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import TensorBoardOutputFormat
 
-from sb3_htr.common.atomic import WRITE_ERRORS, atomic_path, reason
+from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.callback import parts_of
 from sb3_htr.common.checkpoint import DamagedCheckpoint, read_checkpoint, write_checkpoint
+from sb3_htr.common.errors import WRITE_ERRORS, reason
 from sb3_htr.common.settings import check_numbers
 
 # What is recorded but not written yet

@@ -19,7 +19,7 @@ def segment_sum(rows: th.Tensor, lengths: th.Tensor) -> th.Tensor:
     return th.segment_reduce(rows, "sum", lengths=lengths, axis=0, unsafe=True)
 
 
-class _Spread(th.autograd.Function):
+class _RepeatSegments(th.autograd.Function):
     """``repeat_interleave`` with another backward pass."""
 
     @staticmethod
@@ -33,12 +33,12 @@ class _Spread(th.autograd.Function):
         return segment_sum(grads[0].contiguous(), lengths), None, None
 
 
-def spread(values: th.Tensor, lengths: th.Tensor, n: int) -> th.Tensor:
+def repeat_segments(values: th.Tensor, lengths: th.Tensor, n: int) -> th.Tensor:
     """
     :param values: (M, ...), one of each segment
     :param lengths: (M,) int64, which sum to ``n``
     :param n: number of rows, given so that nothing waits for a GPU
     :return: (n, ...), of each row, the value of its segment; its gradient is a :func:`segment_sum`
     """
-    result: th.Tensor = _Spread.apply(values, lengths, n)
+    result: th.Tensor = _RepeatSegments.apply(values, lengths, n)
     return result

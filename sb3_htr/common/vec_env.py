@@ -17,8 +17,8 @@ from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_htr.common.atomic import reason
 from sb3_htr.common.checks import check_has_task_family, check_tasks, missing_hook
+from sb3_htr.common.errors import reason
 from sb3_htr.common.settings import check_numbers
 
 # Side by side, where nobody says how many

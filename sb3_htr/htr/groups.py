@@ -52,3 +52,31 @@ def evenly_spread(lengths: np.ndarray, size: int, rewards: np.ndarray | None = N
         own = steps[first_taken[i] : first_taken[i] + taken[i]]
         own[np.abs(own - best).argmin()] = best
     return steps, taken
+
+
+def stratified_draw(rng: np.random.Generator, ranges: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Draw up to ``width`` integers from each of several ranges, evenly spread: one from each of as many parts of the range.
+
+    Every integer of a range has the same chance to be drawn, and none is drawn twice: a product of Gaussians would count a
+    duplicate in the context as evidence, and a loss that is a mean gains nothing from one.
+
+    :param rng: source of randomness
+    :param ranges: (n, 2) int, first and last + 1 of each range
+    :param width: how many to draw from each range; all of it, where it holds fewer
+    :return: the integers, one range after another, and (n,) int, how many of them are of each range
+    """
+    length = ranges[:, 1] - ranges[:, 0]
+    size = np.minimum(length, width)
+    # Parts differ in size by one, which a random rotation of the range makes up for
+    rotation = (rng.random(len(ranges)) * length).astype(np.int64)
+    # As many random numbers for each range, so that what is drawn from one does not depend on the others
+    uniform = rng.random((len(ranges), width))[np.arange(width) < size[:, None]]
+    n = np.repeat(size, size)
+    part = positions(size)
+    range_length = np.repeat(length, size)
+    first = part * range_length // n
+    end = (part + 1) * range_length // n
+    position = first + (uniform * (end - first)).astype(np.int64) + np.repeat(rotation, size)
+    position -= np.where(position >= range_length, range_length, 0)
+    return position + np.repeat(ranges[:, 0], size), size

@@ -15,7 +15,7 @@ from sb3_htr.common.settings import check_numbers, make
 from sb3_htr.common.task_reward import ROUNDING, task_reward
 from sb3_htr.common.type_aliases import MultiTaskSamples, RewardLabels, TaskFamily
 from sb3_htr.htr.episode_store import EpisodeStore
-from sb3_htr.htr.groups import ascending, first_rows, positions
+from sb3_htr.htr.groups import ascending, first_rows, stratified_draw
 from sb3_htr.htr.n_step import n_step_returns, steps_ahead
 from sb3_htr.htr.relabel import RELABELLERS, Relabeller
 from sb3_htr.htr.reward_hook import check_achieved, check_rewards, check_rewards_told
@@ -23,34 +23,6 @@ from sb3_htr.htr.transitions import Transitions
 
 # Of what was saved, how many rewards are compared with those of the task family
 N_COMPARED = 1000
-
-
-def spread(rng: np.random.Generator, ranges: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Draw up to ``width`` integers from each of several ranges, evenly spread: one from each of as many parts of the range.
-
-    Every integer of a range has the same chance to be drawn, and none is drawn twice: a product of Gaussians would count a
-    duplicate in the context as evidence, and a loss that is a mean gains nothing from one.
-
-    :param rng: source of randomness
-    :param ranges: (n, 2) int, first and last + 1 of each range
-    :param width: how many to draw from each range; all of it, where it holds fewer
-    :return: the integers, one range after another, and (n,) int, how many of them are of each range
-    """
-    length = ranges[:, 1] - ranges[:, 0]
-    size = np.minimum(length, width)
-    # Parts differ in size by one, which a random rotation of the range makes up for
-    rotation = (rng.random(len(ranges)) * length).astype(np.int64)
-    # As many random numbers for each range, so that what is drawn from one does not depend on the others
-    uniform = rng.random((len(ranges), width))[np.arange(width) < size[:, None]]
-    n = np.repeat(size, size)
-    part = positions(size)
-    range_length = np.repeat(length, size)
-    first = part * range_length // n
-    end = (part + 1) * range_length // n
-    position = first + (uniform * (end - first)).astype(np.int64) + np.repeat(rotation, size)
-    position -= np.where(position >= range_length, range_length, 0)
-    return position + np.repeat(ranges[:, 0], size), size
 
 
 def _equal_weights(n: int) -> np.ndarray:
@@ -387,9 +359,9 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             hindsight.check(int(relabelled.sum()), reward_task.shape[1])
             context_source[relabelled], batch_source[relabelled] = hindsight.context, hindsight.batch
             reward_task[relabelled] = hindsight.tasks
-        context, n_context = spread(self._rng, context_source, context_size)
+        context, n_context = stratified_draw(self._rng, context_source, context_size)
         context = ascending(context, n_context)  # an encoder may read it in the order of time
-        batch, n_batch = spread(self._rng, batch_source, batch_size)
+        batch, n_batch = stratified_draw(self._rng, batch_source, batch_size)
         virtual = np.concatenate([context, batch])
         task_of_row = np.concatenate([np.repeat(np.arange(meta_batch_size), n) for n in (n_context, n_batch)])
         store, of_store, rl = self.episodes, relabelled[task_of_row], slice(len(context), None)

@@ -7,6 +7,7 @@ from torch.nn import functional as F
 
 from sb3_htr.common.linear import with_fast_layers
 from sb3_htr.common.segments import segment_sum
+from sb3_htr.common.settings import check_class
 
 # Smallest variance of a factor, as in PEARL's reference implementation
 MIN_VARIANCE = 1e-7
@@ -104,10 +105,15 @@ ENCODERS: dict[str, type[ContextEncoder]] = {encoder.__name__: encoder for encod
 
 def to_encoder_class(encoder: type[ContextEncoder] | str) -> type[ContextEncoder]:
     """
-    :param encoder: a class, or its name
+    :param encoder: a class of modules that has what :class:`sb3_htr.adaptation.policy.Encoder` names, or the name of one here
     :return: the class
-    :raises ValueError: for an unknown name
+    :raises ValueError: for an unknown name, or what is no such class
     """
-    if isinstance(encoder, str) and encoder not in ENCODERS:
-        raise ValueError(f"encoder_class is {encoder!r}, expected one of {sorted(ENCODERS)}, or a class.")
-    return ENCODERS[encoder] if isinstance(encoder, str) else encoder
+    if isinstance(encoder, str):
+        if encoder not in ENCODERS:
+            raise ValueError(f"encoder_class is {encoder!r}, expected one of {sorted(ENCODERS)}, or a class.")
+        return ENCODERS[encoder]
+    check_class("encoder_class", encoder, nn.Module)
+    if missing := [method for method in ("empty", "extend", "posterior") if not hasattr(encoder, method)]:
+        raise ValueError(f"encoder_class {encoder.__name__} has no {', '.join(missing)}: expected what ContextEncoder has.")
+    return encoder

@@ -8,8 +8,8 @@ from typing import TypeAlias
 import torch as th
 
 from sb3_htr.common.errors import last_line
-from sb3_htr.common.packed import Packed, map_tensors, tensors_of
 from sb3_htr.common.type_aliases import MultiTaskSamples
+from sb3_htr.pearl.packed import Packed, map_tensors, tensors_of
 
 # Posterior means, and what to log by its name
 Outcome: TypeAlias = tuple[th.Tensor, dict[str, th.Tensor]]

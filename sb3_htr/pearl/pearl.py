@@ -9,14 +9,14 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_htr.adaptation.explorers import Explorer
-from sb3_htr.common.matmul import PRECISIONS, matmul_precision
-from sb3_htr.common.segments import spread
+from sb3_htr.common.segments import repeat_segments
 from sb3_htr.common.settings import LOWEST, check_flags, check_numbers
 from sb3_htr.common.type_aliases import MultiTaskSamples, RewardLabels
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.pearl.divergence import PosteriorWatch, check_finite
 from sb3_htr.pearl.encoder import ContextEncoder, kl_to_prior
 from sb3_htr.pearl.graphed_update import FixedUpdate, GraphedUpdate, Outcome, can_be_captured
+from sb3_htr.pearl.matmul import PRECISIONS, matmul_precision
 from sb3_htr.pearl.off_policy_meta_algorithm import OffPolicyMetaAlgorithm
 from sb3_htr.pearl.padding import padded
 from sb3_htr.pearl.policies import LatentCritic, MlpPolicy, PEARLPolicy
@@ -294,12 +294,12 @@ class PEARL(OffPolicyMetaAlgorithm):
     def _gradient_step(self, data: MultiTaskSamples, update_target: bool) -> Outcome:
         """The part of an update that a GPU does, and that can be captured: it waits for no value."""
         # Each task has the same weight in a mean over transitions
-        weight = spread(data.task_weights / data.lengths, data.lengths, len(data.rewards))
+        weight = repeat_segments(data.task_weights / data.lengths, data.lengths, len(data.rewards))
         # One backward pass through the encoder: it learns from the critics' errors, the KL term and the reward model's errors
         mean, variance = self.policy.infer(data.context)
         z = mean + variance.sqrt() * th.randn_like(mean)
         kl = (kl_to_prior(mean, variance) * data.task_weights).sum()
-        z_rows = spread(z, data.lengths, len(data.rewards))
+        z_rows = repeat_segments(z, data.lengths, len(data.rewards))
         obs, next_obs = self.policy.normalize(data.observations), self.policy.normalize(data.next_observations)
         obs_z = th.cat([obs, z_rows], dim=1)
         ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp()

@@ -80,8 +80,10 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
     :param observation_space: Box, without the task variable
     :param action_space: Box
     :param lr_schedule: learning rate
-    :param net_arch: hidden units of actor and critics (paper A.2: ``[300, 300, 300]``), or ``{"pi": ..., "qf": ...}``
-    :param encoder_arch: hidden units of the context encoder (paper A.2: ``[200, 200, 200]``)
+    :param net_arch: hidden units of actor and critics, or ``{"pi": ..., "qf": ...}``; ``[128, 128]`` by default (our choice;
+        paper A.2: ``[300, 300, 300]``)
+    :param encoder_arch: hidden units of the context encoder, ``[128, 128]`` by default (our choice; paper A.2:
+        ``[200, 200, 200]``)
     :param encoder_class: what infers z, see :class:`ContextEncoder`; or the name of one of :mod:`sb3_htr.pearl.encoder`
     :param latent_dim: dimension of z (paper A.2: 5)
     :param normalize_observations: all networks see observations less their running mean in training, divided by the standard

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sb3_htr.common.atomic import reason
+from sb3_htr.common.errors import reason
 
 
 @pytest.mark.parametrize(

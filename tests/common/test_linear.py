@@ -13,7 +13,7 @@ from torch.nn.utils import parametrize, prune
 
 from sb3_htr.common import linear
 from sb3_htr.common.linear import MIN_ROWS, Linear, Stack, find_onednn, left_to_torch, with_fast_layers
-from sb3_htr.common.matmul import matmul_precision
+from sb3_htr.pearl.matmul import matmul_precision
 
 LAYERS = {
     "encoder": [nn.Linear(5, 40), nn.ReLU(), nn.Linear(40, 64), nn.ReLU(), nn.Linear(64, 10)],

@@ -16,7 +16,7 @@ from helpers.experience import FAMILY, add_episode, assert_same, by_task, filled
 from htr_envs import PointRobotFamily
 from sb3_htr.htr import EpisodeClustering, SingleEpisodeRelabelling
 from sb3_htr.htr.episode_store import EpisodeStore
-from sb3_htr.htr.multi_task_replay_buffer import spread
+from sb3_htr.htr.groups import stratified_draw
 from sb3_htr.htr.relabel.base import HindsightDraw, Relabeller
 from sb3_htr.htr.transitions import Transitions
 
@@ -30,7 +30,7 @@ both_relabellers = pytest.mark.parametrize("relabeller", RELABELLERS)
 @given(st.integers(0, 1000), st.lists(st.tuples(st.integers(0, 50), st.integers(1, 40)), min_size=1), st.integers(1, 60))
 def test_spread_draws_from_each_range_without_duplicates(seed: int, ranges: list[tuple[int, int]], width: int) -> None:
     start, length = np.array(ranges).T
-    drawn, size = spread(np.random.default_rng(seed), np.stack([start, start + length], axis=1), width)
+    drawn, size = stratified_draw(np.random.default_rng(seed), np.stack([start, start + length], axis=1), width)
     assert size.tolist() == np.minimum(length, width).tolist()
     for values, first, n in zip(np.split(drawn, np.cumsum(size)[:-1]), start, length, strict=True):
         assert values.min() >= first and values.max() < first + n
@@ -39,7 +39,7 @@ def test_spread_draws_from_each_range_without_duplicates(seed: int, ranges: list
 
 def test_spread_gives_every_row_the_same_chance() -> None:
     n = 20_000
-    drawn, _ = spread(np.random.default_rng(0), np.tile([0, 7], (n, 1)), 3)
+    drawn, _ = stratified_draw(np.random.default_rng(0), np.tile([0, 7], (n, 1)), 3)
     np.testing.assert_allclose(np.bincount(drawn, minlength=7) / n, 3 / 7, atol=0.02)
 
 

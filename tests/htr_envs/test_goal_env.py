@@ -540,13 +540,11 @@ def test_the_lines_of_the_manual_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 # ---------------------------------------------------------------- with gymnasium-robotics, panda-gym and Meta-World
 
-SLOW = {"HiddenFetchSlide-v0", "HiddenFetchPickAndPlace-v0", "HiddenAntMazeUMaze-v0", "HiddenMetaWorldPush-v0"}
-
 
 def of_extra(env_id: str, extra: str) -> Any:
     missing = importlib.util.find_spec(EXTRAS[extra]) is None
     skip = pytest.mark.skipif(missing, reason=f"{EXTRAS[extra]} is not installed: pip install 'sb3_htr[{extra}]'")
-    return pytest.param(env_id, marks=[skip, *([pytest.mark.slow] if env_id in SLOW else [])])
+    return pytest.param(env_id, marks=[skip])
 
 
 FETCH = [of_extra(f"HiddenFetch{name}-v0", "robotics") for name in ("Reach", "Push", "Slide", "PickAndPlace")]
@@ -616,7 +614,6 @@ def test_rewards_are_the_same_bits_for_any_batch_shape(env_id: str) -> None:
         assert np.array_equal(together[:, 7], [base.compute_reward(step, task, reward_type)[0] for task in tasks])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("env_id", [FETCH[0], MAZES[0], PANDA[0]])
 def test_processes_of_their_own_play_the_same(env_id: str) -> None:
     def episode(**kwargs: Any) -> list[Any]:

@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 from helpers import ROLLOUT, MakePEARL, parameters, with_policy
 from helpers.recording import capture
 from sb3_htr import PEARL
-from sb3_htr.common.packed import Packed, tensors_of
 from sb3_htr.common.resume import CheckpointCallback, load_latest
 from sb3_htr.common.type_aliases import MultiTaskSamples
 from sb3_htr.pearl import graphed_update
 from sb3_htr.pearl.graphed_update import FixedUpdate, GraphedUpdate, capturable
+from sb3_htr.pearl.packed import Packed, tensors_of
 from sb3_htr.pearl.padding import padded
 
 SETTINGS: dict[str, Any] = {

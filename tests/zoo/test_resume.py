@@ -33,7 +33,9 @@ from sb3_htr.zoo.run.shipped import hyperparams_file
 STEPS = 2400
 SMALL = ["n_envs:4", "n_tasks_per_rollout:4", "n_episodes_per_task:3", "learning_starts:240", "gradient_steps:4"]
 NETS = ["meta_batch_size:8", "batch_size:4", "policy_kwargs:{'net_arch':[16],'encoder_arch':[16],'latent_dim':3}"]
-ARGUMENTS = ["train", "--env", ENV_ID, "-n", str(STEPS), "--seed", "3", "--eval-freq", "480", "--save-freq", "1"]
+ARGUMENTS = ["train", "--env", ENV_ID, "-n", str(STEPS), "--seed", "3", "--save-freq", "1"]
+# Two adaptation episodes show that evaluations are the same, and 20 would take most of the time
+ARGUMENTS += ["--eval-freq", "480", "--eval-episodes", "2"]
 # Near goals, so that there are rewards to compare
 TRAIN = [*ARGUMENTS, "--verbose", "0", "--env-kwargs", "goal_distance:0.4", "-params", *SMALL, *NETS]
 
@@ -268,7 +270,7 @@ def test_the_last_one_cleans_up(unbroken: Path, tmp_path: Path) -> None:
 
 def test_kills_at_random_moments_change_nothing(unbroken: Path, tmp_path: Path) -> None:
     """SIGKILL of a real process, again and again."""
-    n_kills = int(os.environ.get("SB3_HTR_KILLS", 6))
+    n_kills = int(os.environ.get("SB3_HTR_KILLS", 4))
     moments = random.Random(n_kills)
     command = [sys.executable, "-m", "sb3_htr.zoo.cli"]
     run = run_folder(tmp_path)
@@ -355,7 +357,7 @@ def test_a_full_disk_stops_no_training(tmp_path: Path, monkeypatch: pytest.Monke
 
     monkeypatch.setattr(module, "write_checkpoint", write)
     with pytest.warns(UserWarning, match="No space left on device.*Training goes on"):
-        assert main([*TRAIN, "-f", str(tmp_path)]) == 0
+        assert main([*TRAIN, "--eval-freq", "-1", "-n", "1440", "-f", str(tmp_path)]) == 0
     steps = [int(folder.name.split("_")[0]) for folder in calls]
     assert np.diff(steps).tolist() == [240] * (len(steps) - 1), "the next rollout tries again"
     assert len(checkpoints(run_folder(tmp_path))) == 2
@@ -405,16 +407,13 @@ class InterruptsOnce(BaseCallback):
         return True
 
 
-@pytest.mark.parametrize(
-    ("given", "trust"), [(["-n720"], False), (["-n", "720", "--eval-fre", "-1"], True), (["-n", "720"], True)]
-)
+@pytest.mark.parametrize(("given", "trust"), [(["-n720"], False), (["-n", "720"], True)])
 def test_the_command_that_is_printed_to_go_on_is_taken(
     given: list[str], trust: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A user may have said what a file, which may come from a stranger, may not."""
     monkeypatch.setattr(InterruptsOnce, "done", False)
-    by_name = trust and "--eval-fre" not in given
-    if by_name:
+    if trust:
         settings = [f"callback:'{__name__}.InterruptsOnce'"]
     else:
         settings = []

@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import CSVOutputFormat, TensorBoardOutputFormat
 
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
-from sb3_htr.common.atomic import reason
+from sb3_htr.common.errors import reason
 
 
 class PatientCSV(CSVOutputFormat):

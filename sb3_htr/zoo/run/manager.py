@@ -35,7 +35,8 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
-from sb3_htr.common.atomic import WRITE_ERRORS, atomic_path, reason
+from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.errors import WRITE_ERRORS, reason
 from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.resume import CheckpointCallback, checkpoints, cut_monitor_files, load_latest
 from sb3_htr.common.settings import check_keywords, check_numbers, keywords_of
