@@ -17,7 +17,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_htr.adaptation.loop import Adapting
 from sb3_htr.experiments.grid import EXPERIMENTS, Experiment, Variant
-from sb3_htr.rivals.base import RivalAdaptation
+from sb3_htr.rivals.adaptation import RivalAdaptation
 from sb3_htr.rivals.on_policy import OnPolicyRival
 from sb3_htr.zoo.run.algorithm import register_algorithm
 from sb3_htr.zoo.run.method import register_method

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from htr_envs.position_goals import PositionGoalFamily
-from htr_envs.task_env import FloatArray, draw_task_sets
+from htr_envs.task_env import FloatArray
+from htr_envs.task_sets import draw_task_sets
 
 LOCOMOTION_ARENA = 20.0  # a robot gets up to 10 in 200 steps
 

@@ -9,7 +9,8 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from htr_envs.dynamics import Dynamics, DynamicsEnv, DynamicsVectorEnv
-from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, at_step, check_reward_type, draw_task_sets
+from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, at_step, check_reward_type
+from htr_envs.task_sets import draw_task_sets
 
 FRICTION = np.float32(0.95)
 THRUST = np.float32(0.2)

@@ -27,7 +27,8 @@ from htr_envs.point_robot import PointRobotDynamics
 from sb3_htr import PEARL, AdaptedAgent, evaluate_adaptation, load_untrusted
 from sb3_htr.adaptation import Step
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
-from sb3_htr.common.checks import check_tasks, family_facts, get_task_family
+from sb3_htr.common.checks import check_tasks, get_task_family
+from sb3_htr.common.family_facts import family_facts
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
 from sb3_htr.rivals.rl2 import RL2
 from sb3_htr.rivals.scripted import ScriptedAgent

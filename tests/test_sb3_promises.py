@@ -22,8 +22,8 @@ from helpers import ENV_ID, ROLLOUT, MakePEARL
 from helpers import parameters as all_parameters
 from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.adaptation import MetaEvalCallback
-from sb3_htr.common.resume import CheckpointCallback as Checkpointing
-from sb3_htr.common.resume import load_latest
+from sb3_htr.common.checkpoint import load_latest
+from sb3_htr.common.checkpoint_callback import CheckpointCallback as Checkpointing
 from sb3_htr.common.vec_env import make_task_vec_env
 
 

@@ -20,9 +20,8 @@ from helpers import ENV_ID, MakePEARL
 from helpers.bombs import Bomb, bombs
 from helpers.runs import make_run
 from sb3_htr import load_untrusted
-from sb3_htr.common.checkpoint import MANIFEST, DamagedCheckpoint, read_checkpoint, write_checkpoint
-from sb3_htr.common.plain import load_plain
-from sb3_htr.common.resume import checkpoints
+from sb3_htr.common.checkpoint import MANIFEST, DamagedCheckpoint, checkpoints, read_checkpoint, write_checkpoint
+from sb3_htr.common.safe_load import load_plain
 from sb3_htr.zoo.cli import console, main
 from sb3_htr.zoo.commands.optimize import create_study
 from sb3_htr.zoo.run.agents import RECORD, agent_at, find_runs

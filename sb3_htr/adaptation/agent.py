@@ -12,7 +12,7 @@ from sb3_htr.adaptation.actor_alone import acting_state, make_actor_alone
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.errors import OPEN_ERRORS
 from sb3_htr.common.latent_policy import Obs, State
-from sb3_htr.common.plain import load_plain
+from sb3_htr.common.safe_load import load_plain
 from sb3_htr.common.saving import with_suffix
 
 FORMAT = 1

@@ -16,7 +16,8 @@ from sb3_htr.common.checks import check_is_env, get_task_family
 from sb3_htr.common.random_state import MAX_SEED, kept_env_states, seeded_actions
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.type_aliases import TaskFamily
-from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env, reset_to_tasks, seed_envs
+from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env, reset_to_tasks
+from sb3_htr.common.vec_wrappers import seed_envs
 
 #: Sets of tasks that a family has
 TASK_SETS = ("test", "validation", "train")

@@ -1,9 +1,10 @@
-"""Folders of plain data: never half written, damage is noticed, and reading one runs no code."""
+"""Checkpoints, folders of plain data: never half written, damage is noticed, and reading one runs no code."""
 
 import hashlib
 import json
 import os
-from pathlib import Path
+import warnings
+from pathlib import Path, PurePath
 from typing import Any
 
 import torch as th
@@ -13,6 +14,8 @@ from sb3_htr.common.versions import versions
 
 FORMAT = 1
 STATE, MANIFEST = "state.pt", "manifest.json"
+# In the folder of a run
+CHECKPOINTS = "checkpoints"
 
 
 class DamagedCheckpoint(ValueError):
@@ -70,3 +73,44 @@ def _sha256(path: Path) -> str:
         while block := file.read(1 << 20):
             digest.update(block)
     return digest.hexdigest()
+
+
+def checkpoints(run: Path) -> list[Path]:
+    """
+    :param run: folder of a run
+    :return: its checkpoints, the latest first
+    """
+    folders = [path for path in (run / CHECKPOINTS).glob("*_steps") if path.name.removesuffix("_steps").isdecimal()]
+    return sorted(folders, key=n_steps_at, reverse=True)
+
+
+def n_steps_at(checkpoint: PurePath) -> int:
+    """
+    :param checkpoint: folder
+    :return: env steps before it
+    """
+    return int(checkpoint.name.removesuffix("_steps"))
+
+
+def n_steps_done(run: Path) -> int:
+    """
+    :param run: folder of a run
+    :return: env steps before its latest checkpoint, 0 without one
+    """
+    return next(map(n_steps_at, checkpoints(run)), 0)
+
+
+def load_latest(run: Path) -> tuple[Path, dict[str, Any]]:
+    """
+    :param run: folder of a run
+    :return: the latest checkpoint that is whole, and its state; those that are not are warned of
+    :raises FileNotFoundError: if there is none
+    """
+    for folder in checkpoints(run):
+        try:
+            return folder, read_checkpoint(folder)
+        except DamagedCheckpoint as error:
+            warnings.warn(f"{error} The next older checkpoint is tried.", stacklevel=2)
+    raise FileNotFoundError(
+        f"There is no checkpoint to go on from in {run / CHECKPOINTS}: move {run} away, and train again, with --save-freq."
+    )

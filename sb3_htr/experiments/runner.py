@@ -14,10 +14,10 @@ import htr_envs  # noqa: F401 registers the envs
 from sb3_htr.adaptation.explorers import to_explorer
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.common.resume import checkpoints
+from sb3_htr.common.checkpoint import checkpoints
 from sb3_htr.common.versions import UNKNOWN_HARDWARE, commit, hardware, named, versions
 from sb3_htr.experiments.cell import Cell
-from sb3_htr.experiments.kept import FOLDER, Kept, digest_of_code
+from sb3_htr.experiments.evaluation_cache import FOLDER, Kept, digest_of_code
 from sb3_htr.experiments.log import logged
 from sb3_htr.experiments.protocol import evaluate
 from sb3_htr.pearl.untrusted import EXPLORERS, check_is_ours

@@ -9,7 +9,8 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 
-from sb3_htr.common.checks import check_has_hooks, check_same_family, family_facts, missing_hook
+from sb3_htr.common.checks import check_has_hooks, missing_hook
+from sb3_htr.common.family_facts import check_same_family, family_facts
 from sb3_htr.common.random_state import get_generator_state, set_generator_state, stream
 from sb3_htr.common.settings import check_numbers, make
 from sb3_htr.common.task_reward import ROUNDING, task_reward

@@ -29,6 +29,7 @@ from sb3_htr.adaptation.task_bank import TaskBank
 from sb3_htr.common import checks
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.callback import followed_by
+from sb3_htr.common.family_facts import check_same_family, family_facts
 from sb3_htr.common.latent_policy import Obs, State
 from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.random_state import (
@@ -42,7 +43,8 @@ from sb3_htr.common.random_state import (
 from sb3_htr.common.saving import CheckedFiles, with_suffix
 from sb3_htr.common.settings import check_class, check_keywords, check_mappings, check_numbers, plain
 from sb3_htr.common.training_state import Resumable
-from sb3_htr.common.vec_env import in_float32, make_task_vec_env, seed_envs
+from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.common.vec_wrappers import in_float32, seed_envs
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.htr.reward_hook import check_reward_hook
 from sb3_htr.pearl.horizon import BY_HORIZON, STEPS_PER_UPDATE, complete, timesteps_for
@@ -284,8 +286,8 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         checks.check_rewards(vec_env)
         family, n_steps = checks.get_task_family(vec_env), checks.get_max_episode_steps(vec_env)
         if self.replay_buffer is not None and self.replay_buffer.size() > 0:
-            known = checks.family_facts(self.replay_buffer.task_family)
-            checks.check_same_family(known, checks.family_facts(family), "The env")
+            known = family_facts(self.replay_buffer.task_family)
+            check_same_family(known, family_facts(family), "The env")
             self.replay_buffer.check_rewards_of(family)
             if n_steps > self.replay_buffer.max_episode_steps:
                 raise ValueError(

@@ -13,7 +13,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from sb3_htr.adaptation import explorers
 from sb3_htr.common.checks import check_recorded_spaces, check_spaces
 from sb3_htr.common.errors import OPEN_ERRORS, last_line
-from sb3_htr.common.plain import Refused, read_model
+from sb3_htr.common.safe_load import Refused, read_model
 from sb3_htr.common.saving import with_suffix
 from sb3_htr.common.settings import keywords_of
 from sb3_htr.common.vec_env import make_task_vec_env

@@ -1,7 +1,7 @@
 """What the rivals share: they train on the envs of PEARL, are evaluated as PEARL is, and go on from the same checkpoints."""
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -13,7 +13,6 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_htr.adaptation.adaptation import Step, check_rows, check_step
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
 from sb3_htr.adaptation.loop import Adapting
 from sb3_htr.common.callback import followed_by, parts_of
@@ -29,7 +28,9 @@ from sb3_htr.common.random_state import checked_seed
 from sb3_htr.common.saving import CheckedFiles
 from sb3_htr.common.settings import check_keywords, check_numbers
 from sb3_htr.common.training_state import Resumable
-from sb3_htr.common.vec_env import N_ENVS, in_float32, make_task_vec_env, seed_envs, set_tasks
+from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env, set_tasks
+from sb3_htr.common.vec_wrappers import in_float32, seed_envs
+from sb3_htr.rivals.adaptation import OwnWay, check_explores_in_own_way
 
 SelfRival = TypeVar("SelfRival", bound="Rival")
 # Settings of SB3's algorithms which these do not check: smallest and largest value
@@ -51,102 +52,6 @@ RANGES: dict[str, tuple[float] | tuple[float, float]] = {
     "policy_delay": (1,),
     "target_update_interval": (1,),
 }
-
-
-class OwnWay:
-    """In the place of an explorer."""
-
-    name = "own"
-
-
-def check_explores_in_own_way(agent: object, explorer: Any) -> None:
-    """
-    :param agent: that has no explorers
-    :param explorer: what is asked for
-    :raises ValueError: if that is one
-    """
-    if explorer not in (None, OwnWay.name):
-        raise ValueError(f"{type(agent).__name__} has no explorers, but the explorer is {explorer!r}: leave it out.")
-
-
-class RivalAdaptation(ABC):
-    """
-    Keeps what anybody can see of an adaptation; a subclass says how to act.
-
-    :param n_envs: number of tasks
-    """
-
-    def __init__(self, n_envs: int) -> None:
-        self.n_envs = n_envs
-        self._found = np.zeros(n_envs, dtype=bool)
-
-    @abstractmethod
-    def act(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
-        """
-        :param obs: (n_envs, obs_dim)
-        :param deterministic: mean actions instead of samples
-        :return: (n_envs, action_dim), scaled to [-1, 1]
-        """
-
-    def observe(self, step: Step) -> None:
-        """
-        :param step: what each env did
-        :raises ValueError: for arrays of other shapes, NaN and infinity, and actions that are not scaled
-        """
-        # How wide they are is the env's, which an adaptation of one's own need not know
-        obs_dim, action_dim = (np.atleast_1d(rows).shape[-1] for rows in (step.observations, step.actions))
-        check_step(step, self.n_envs, obs_dim, action_dim)
-        if step.infos:
-            self._found |= [bool(info.get("is_success", False)) for info in step.infos]
-
-    def exploring(self) -> np.ndarray:
-        """
-        :return: (n_envs,) bool, whether the task was not solved yet; for those who watch, the agent is not told
-        """
-        return ~self._found
-
-    def _check_observations(self, obs: np.ndarray) -> None:
-        # How wide they are, networks and scripts say themselves
-        check_rows("observations", obs, self.n_envs, *np.shape(obs)[1:])
-
-    def deviation(self) -> np.ndarray:
-        """
-        :return: (n_envs,) NaN: there is no z
-        """
-        return np.full(self.n_envs, np.nan)
-
-
-class ToldAdaptation(RivalAdaptation):
-    """
-    No adaptation at all: who acts is told the tasks.
-
-    :param n_envs: number of tasks
-    :param act: observations (n_envs, obs_dim), tasks (n_envs, task_dim) and whether actions are to be means instead of
-        samples, to actions (n_envs, action_dim) scaled to [-1, 1]
-    """
-
-    def __init__(self, n_envs: int, act: Callable[[np.ndarray, np.ndarray, bool], np.ndarray]) -> None:
-        super().__init__(n_envs)
-        self._act = act
-        self._tasks: np.ndarray | None = None
-
-    def see_tasks(self, tasks: np.ndarray) -> None:
-        """
-        :param tasks: (n_envs, task_dim)
-        """
-        self._tasks = tasks
-
-    def act(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
-        if self._tasks is None:
-            raise ValueError("Who acts here is told its tasks: call see_tasks, with a row for each env, first.")
-        self._check_observations(obs)
-        return self._act(obs, self._tasks, deterministic)
-
-    def exploring(self) -> np.ndarray:
-        """
-        :return: (n_envs,) False: there is nothing to find out
-        """
-        return np.zeros(self.n_envs, dtype=bool)
 
 
 class FreshStart(BaseCallback):
@@ -200,6 +105,8 @@ class Rival(CheckedFiles, Resumable):
     #: Settings, whole numbers, that an agent which is loaded to act has of its training, and those that it has in their place
     ACTS_BY: ClassVar[tuple[str, ...]] = ()
     ACTS_WITH: ClassVar[dict[str, Any]] = {}
+    #: Attributes, beside settings, that it acts by: ``export`` writes them, and loading by ``--trust`` or ``load`` reads them
+    KEPT_TO_ACT: ClassVar[tuple[str, ...]] = ()
     FOLLOWS: ClassVar[dict[str, str]] = {"use_sde": "its noise is drawn before a rollout, and in no checkpoint"}
     explorer = OwnWay()
 
@@ -376,21 +283,3 @@ class Rival(CheckedFiles, Resumable):
                     "sb3_htr.adaptation.callbacks.MetaEvalCallback in its place."
                 )
         return super()._init_callback(result, progress_bar)
-
-
-def scaled(actions: np.ndarray, space: spaces.Box) -> np.ndarray:
-    """
-    :param actions: (..., action_dim), in the bounds of the action space
-    :param space: of actions
-    :return: the same, float32, scaled to [-1, 1]
-    """
-    return np.asarray(2.0 * (actions - space.low) / (space.high - space.low) - 1.0, dtype=np.float32)
-
-
-def unscaled(actions: np.ndarray, space: spaces.Box) -> np.ndarray:
-    """
-    :param actions: (..., action_dim), scaled to [-1, 1]
-    :param space: of actions
-    :return: the same, float32, in the bounds of the action space
-    """
-    return np.asarray(space.low + 0.5 * (actions + 1.0) * (space.high - space.low), dtype=np.float32)

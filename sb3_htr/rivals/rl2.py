@@ -15,7 +15,7 @@ from sb3_htr.adaptation.loop import Adapting
 from sb3_htr.common.checks import get_max_episode_steps
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
-from sb3_htr.rivals.base import RivalAdaptation
+from sb3_htr.rivals.adaptation import RivalAdaptation
 from sb3_htr.rivals.on_policy import OnPolicyRival
 from sb3_htr.rivals.trial_policy import TrialFeatures, TrialLstmPolicy
 from sb3_htr.rivals.trials import LastStep, TrialVecEnv

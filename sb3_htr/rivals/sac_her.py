@@ -18,18 +18,13 @@ from stable_baselines3.sac import SAC
 from stable_baselines3.sac.policies import MultiInputPolicy, SACPolicy
 
 from sb3_htr.adaptation.loop import Adapting
-from sb3_htr.common.checks import (
-    check_has_env,
-    check_rewards,
-    check_same_family,
-    family_facts,
-    get_max_episode_steps,
-    get_task_family,
-)
+from sb3_htr.common.checks import check_has_env, check_rewards, get_max_episode_steps, get_task_family
+from sb3_htr.common.family_facts import check_same_family, family_facts
 from sb3_htr.common.settings import check_keywords, check_numbers
 from sb3_htr.common.type_aliases import Trajectory
 from sb3_htr.htr.reward_hook import check_rewards_told
-from sb3_htr.rivals.base import ToldAdaptation, unscaled
+from sb3_htr.rivals.actions import unscaled
+from sb3_htr.rivals.adaptation import ToldAdaptation
 from sb3_htr.rivals.off_policy import OffPolicyRival
 from sb3_htr.rivals.shown_task import ShownTaskVecEnv
 
@@ -121,6 +116,7 @@ class SACHER(OffPolicyRival, SAC):
     """
 
     DEFAULT_POLICY: ClassVar[str] = "MultiInputPolicy"
+    KEPT_TO_ACT: ClassVar[tuple[str, ...]] = ("shown",)
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": MultiInputPolicy}
     WRAPPERS: ClassVar[tuple[type[VecEnv], ...]] = (ShownTaskVecEnv,)
     FOLLOWS: ClassVar[dict[str, str]] = {

@@ -9,7 +9,8 @@ from gymnasium import spaces
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_htr.rivals.base import OwnWay, ToldAdaptation, check_explores_in_own_way, unscaled
+from sb3_htr.rivals.actions import unscaled
+from sb3_htr.rivals.adaptation import OwnWay, ToldAdaptation, check_explores_in_own_way
 
 # Observations (n, obs_dim) and tasks (n, task_dim) to actions (n, action_dim), scaled to [-1, 1]
 Script = Callable[[np.ndarray, np.ndarray], np.ndarray]

@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 
 from sb3_htr.common.checks import check_finite, check_has_hooks, check_spaces, get_task_family
 from sb3_htr.common.type_aliases import TaskFamily, Trajectory
-from sb3_htr.common.vec_env import CopiedWrapper
+from sb3_htr.common.vec_wrappers import CopiedWrapper
 
 
 class ShownTask:

@@ -9,8 +9,9 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 
 from sb3_htr.common.checks import check_spaces, get_max_episode_steps, get_task_family
 from sb3_htr.common.settings import check_numbers
-from sb3_htr.common.vec_env import CopiedWrapper, set_tasks
-from sb3_htr.rivals.base import scaled
+from sb3_htr.common.vec_env import set_tasks
+from sb3_htr.common.vec_wrappers import CopiedWrapper
+from sb3_htr.rivals.actions import scaled
 
 
 class LastStep:

@@ -8,7 +8,7 @@ import gymnasium as gym
 
 from sb3_htr.common.checks import check_recorded_spaces
 from sb3_htr.common.errors import OPEN_ERRORS, last_line
-from sb3_htr.common.plain import read_model
+from sb3_htr.common.safe_load import read_model
 from sb3_htr.rivals.base import Rival
 
 SelfRival = TypeVar("SelfRival", bound=Rival)

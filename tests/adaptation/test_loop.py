@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from helpers import ENV_ID
 from sb3_htr.adaptation import Step
 from sb3_htr.adaptation.loop import adaptation_steps
-from sb3_htr.rivals.base import RivalAdaptation
+from sb3_htr.rivals.adaptation import RivalAdaptation
 
 
 class Noting(RivalAdaptation):

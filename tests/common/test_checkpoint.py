@@ -11,9 +11,16 @@ import torch as th
 
 from helpers.bombs import Bomb
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.common.checkpoint import MANIFEST, STATE, DamagedCheckpoint, read_checkpoint, write_checkpoint
+from sb3_htr.common.checkpoint import (
+    MANIFEST,
+    STATE,
+    DamagedCheckpoint,
+    checkpoints,
+    load_latest,
+    read_checkpoint,
+    write_checkpoint,
+)
 from sb3_htr.common.random_state import get_global_state, set_global_state
-from sb3_htr.common.resume import checkpoints, load_latest
 
 
 def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:

@@ -21,7 +21,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
-from sb3_htr.common.resume import CheckpointCallback, checkpoints, load_latest, numbers_of, restore_numbers
+from sb3_htr.common.checkpoint import checkpoints, load_latest
+from sb3_htr.common.checkpoint_callback import CheckpointCallback, numbers_of, restore_numbers
 from sb3_htr.common.vec_env import make_task_vec_env
 
 

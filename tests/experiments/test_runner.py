@@ -18,14 +18,13 @@ from helpers.results import made_up
 from helpers.runs import OF_CELL
 from sb3_htr import PEARL, evaluate_adaptation, make_task_vec_env
 from sb3_htr.adaptation.explorers import EXPLORERS, Prior
-from sb3_htr.common.checkpoint import write_checkpoint
-from sb3_htr.common.resume import checkpoints
+from sb3_htr.common.checkpoint import checkpoints, write_checkpoint
 from sb3_htr.common.versions import hardware
 from sb3_htr.experiments import grid
 from sb3_htr.experiments.cell import Cell
+from sb3_htr.experiments.evaluation_cache import FOLDER, digest_of_code
 from sb3_htr.experiments.executors import Here
 from sb3_htr.experiments.grid import Experiment, Variant, by
-from sb3_htr.experiments.kept import FOLDER, digest_of_code
 from sb3_htr.experiments.protocol import evaluate
 from sb3_htr.experiments.runner import find_finished, run_cell
 from sb3_htr.zoo.cli import main
@@ -147,7 +146,7 @@ def test_a_last_checkpoint_that_cannot_be_written_is_no_interrupt(tmp_path: Path
             raise OSError(28, "No space left on device")
         write_checkpoint(folder, state)
 
-    monkeypatch.setattr("sb3_htr.common.resume.write_checkpoint", write_unless_last)
+    monkeypatch.setattr("sb3_htr.common.checkpoint_callback.write_checkpoint", write_unless_last)
     train.main([*cell.training(cell.run_folder(tmp_path)), "--save-freq", "1"])
     with pytest.raises(OSError, match="has its last model, but its last checkpoint could not be written"):
         run_cell(cell, tmp_path)

@@ -27,7 +27,7 @@ from helpers import ENV_ID
 from helpers.bucket import PROTOCOL, Bucket
 from helpers.results import made_up
 from helpers.runs import OF_CELL
-from sb3_htr.common.resume import n_steps_at
+from sb3_htr.common.checkpoint import n_steps_at
 from sb3_htr.experiments import driver as driver_module
 from sb3_htr.experiments import grid
 from sb3_htr.experiments.cell import Cell

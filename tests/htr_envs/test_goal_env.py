@@ -23,7 +23,7 @@ from helpers.drawing import skip_where_mujoco_cannot_draw
 from htr_envs import HiddenGoalEnv, HiddenGoalFamily, HiddenGoalWrapper, Trajectory, check_task_env, goal_env_source, hide_goal
 from htr_envs.goal_env import find_hidden
 from sb3_htr import PEARL, evaluate_adaptation
-from sb3_htr.common.checks import family_facts
+from sb3_htr.common.family_facts import family_facts
 from sb3_htr.common.vec_env import make_task_vec_env
 
 PAGE = Path(__file__).parents[2] / "docs" / "envs" / "hidden_goal.md"

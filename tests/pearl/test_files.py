@@ -32,7 +32,7 @@ from helpers.bombs import Bomb, bombs
 from sb3_htr import PEARL, AdaptedAgent, evaluate_adaptation, load_untrusted
 from sb3_htr.adaptation import Aggregate, Belief, Prior
 from sb3_htr.common.arrays import load_arrays
-from sb3_htr.common.plain import box_in_words
+from sb3_htr.common.safe_load import box_in_words
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.htr import EpisodeClustering
 from sb3_htr.pearl.pearl import LEARNING_RATE

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from helpers import ROLLOUT, MakePEARL, parameters, with_policy
 from helpers.recording import capture
 from sb3_htr import PEARL
-from sb3_htr.common.resume import CheckpointCallback, load_latest
+from sb3_htr.common.checkpoint import load_latest
+from sb3_htr.common.checkpoint_callback import CheckpointCallback
 from sb3_htr.common.type_aliases import MultiTaskSamples
 from sb3_htr.pearl import graphed_update
 from sb3_htr.pearl.graphed_update import FixedUpdate, GraphedUpdate, capturable

@@ -30,6 +30,7 @@ from sb3_htr.rivals.on_policy import OnPolicyRival
 from sb3_htr.rivals.rl2 import RL2
 from sb3_htr.rivals.untrusted import load_untrusted
 from sb3_htr.zoo.cli import main
+from sb3_htr.zoo.commands.export import export
 from sb3_htr.zoo.run import algorithm, method
 from sb3_htr.zoo.run.agents import RECORD, TrainedAgent, agent_at
 
@@ -270,6 +271,17 @@ def test_what_could_not_be_evaluated_is_not_trained(registered: Any, tmp_path: P
     monkeypatch.setattr(registered.PlainPPO, "POLICY_SIZES", {"latent_dim": 8})
     with pytest.raises(TypeError, match="NoneType"):
         run_cell(cell, tmp_path)
+
+
+def test_what_it_acts_by_is_exported(registered: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registered.PlainPPO, "KEPT_TO_ACT", ("gain",))
+    model = registered.PlainPPO("MlpPolicy", ENV_ID, **SMALL)
+    model.gain, model.loss = 0.5, 2.0
+    model.save(tmp_path / "model.zip")
+    record = {"method": "plain-ppo", "env_id": ENV_ID, "env_kwargs": {}, "seed": 0, "gym_packages": [MODULE]}
+    export(TrainedAgent(tmp_path / "model.zip", record, None, trusted=True), tmp_path / "exported.zip")
+    loaded = registered.PlainPPO.load(tmp_path / "exported.zip")
+    assert loaded.gain == 0.5 and not hasattr(loaded, "loss")
 
 
 def test_a_model_of_a_method_that_is_not_known_says_so(registered: Any, tmp_path: Path) -> None:

@@ -16,7 +16,8 @@ from helpers import parameters as parameters_of
 from helpers.disks import disk
 from helpers.runs import run_folder, train_arguments
 from sb3_htr import PEARL
-from sb3_htr.common.resume import CheckpointCallback, checkpoints, load_latest
+from sb3_htr.common.checkpoint import checkpoints, load_latest
+from sb3_htr.common.checkpoint_callback import CheckpointCallback
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run.callbacks import ProgressCallback
@@ -133,7 +134,7 @@ def test_a_lost_progress_file_is_written_anew(tiny_pearl: MakePEARL, tmp_path: P
 def test_an_old_checkpoint_that_cannot_be_removed_ends_no_training(
     tiny_pearl: MakePEARL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import sb3_htr.common.resume as module
+    import sb3_htr.common.checkpoint_callback as module
 
     def refuse(path: Path) -> None:
         raise PermissionError(1, "Operation not permitted", str(path))

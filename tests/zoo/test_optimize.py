@@ -30,7 +30,7 @@ from sb3_htr.zoo.run.agents import RECORD
 from sb3_htr.zoo.run.algorithm import ALGORITHMS
 from sb3_htr.zoo.run.manager import MetaExperimentManager
 from sb3_htr.zoo.run.method import PEARLMethod, get_method, merged, methods
-from sb3_htr.zoo.run.storage import absolute, without_password
+from sb3_htr.zoo.run.study import absolute, without_password
 
 SMALL = ["-params", "n_tasks_per_rollout:4", "n_episodes_per_task:3", "learning_starts:240", "n_envs:4"]
 

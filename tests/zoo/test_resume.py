@@ -22,8 +22,8 @@ from helpers import ENV_ID
 from helpers import parameters as model_parameters
 from helpers.runs import run_folder
 from sb3_htr import PEARL
-from sb3_htr.common.checkpoint import write_checkpoint
-from sb3_htr.common.resume import checkpoints, cut_monitor_files, load_latest
+from sb3_htr.common.checkpoint import checkpoints, load_latest, write_checkpoint
+from sb3_htr.common.checkpoint_callback import cut_monitor_files
 from sb3_htr.common.versions import named
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run.manager import MetaExperimentManager
@@ -345,7 +345,7 @@ def test_a_dead_env_process_is_named_by_the_command(tmp_path: Path, monkeypatch:
 
 
 def test_a_full_disk_stops_no_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import sb3_htr.common.resume as module
+    import sb3_htr.common.checkpoint_callback as module
 
     calls = []
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from filelock import Timeout
 
-from sb3_htr.common.resume import n_steps_done
+from sb3_htr.common.checkpoint import n_steps_done
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.runner import lock_of, run_cell
 

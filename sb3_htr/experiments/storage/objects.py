@@ -14,9 +14,8 @@ from typing import Any, TypeVar
 from fsspec import AbstractFileSystem
 from fsspec.core import url_to_fs
 
-from sb3_htr.common.checkpoint import MANIFEST
+from sb3_htr.common.checkpoint import CHECKPOINTS, MANIFEST, n_steps_at
 from sb3_htr.common.errors import last_line
-from sb3_htr.common.resume import CHECKPOINTS, n_steps_at
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.runner import run_cell
 from sb3_htr.experiments.storage.claim import RENEW, Claim, Objects, Watch, claims_among

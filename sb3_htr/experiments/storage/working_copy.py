@@ -8,8 +8,7 @@ from tempfile import TemporaryDirectory
 
 from fsspec import AbstractFileSystem
 
-from sb3_htr.common.checkpoint import MANIFEST
-from sb3_htr.common.resume import CHECKPOINTS, checkpoints
+from sb3_htr.common.checkpoint import CHECKPOINTS, MANIFEST, checkpoints
 
 # Version of what is there, and was not fetched
 HALF = 0, 0

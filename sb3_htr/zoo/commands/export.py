@@ -15,6 +15,7 @@ from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.settings import keywords_of
 from sb3_htr.common.vec_env import N_ENVS
+from sb3_htr.rivals.base import Rival
 from sb3_htr.zoo.commands.arguments import add_agent_arguments, make_parser, parse
 from sb3_htr.zoo.run.agents import RECORD, TrainedAgent
 from sb3_htr.zoo.run.hub import CARD, FILM, files, model_name, push
@@ -26,7 +27,7 @@ EXAMPLE = """  sb3-htr export runs/htr-ser/SparsePointRobot-v0_1 -o my_agent
 # What a loaded model needs beside the arguments of its class
 ALSO_KEPT = (
     *("observation_space", "action_space", "policy_class", "n_envs", "max_episode_steps"),
-    *("num_timesteps", "_n_updates", "shown"),
+    *("num_timesteps", "_n_updates"),
 )
 # Of a run's record, what holds on other machines too
 KEPT_OF_RECORD = ("env_id", "method", "env_kwargs", "gym_packages", "seed", "n_timesteps", "hyperparams", "versions")
@@ -52,7 +53,9 @@ def export(agent: TrainedAgent, path: Path) -> dict[str, Any]:
         model.critic.half()
         for target, parameter in zip(model.critic_target.parameters(), model.critic.parameters(), strict=True):
             target.data = parameter.data
-    kept = {*keywords_of(type(model)), *ALSO_KEPT} - {"tensorboard_log", *getattr(type(model), "ACTS_WITH", ())}
+    kept = {*keywords_of(type(model)), *ALSO_KEPT} - {"tensorboard_log"}
+    if isinstance(model, Rival):
+        kept = kept - {*model.ACTS_WITH} | {*model.KEPT_TO_ACT}
     record = {key: agent.record[key] for key in KEPT_OF_RECORD if key in agent.record}
     which = "best on the validation tasks" if agent.path.stem == "best_model" else "last"
     record["command"] = training_command(agent.record)

@@ -11,7 +11,7 @@ import optuna
 import sqlalchemy
 
 from sb3_htr.zoo.commands import train
-from sb3_htr.zoo.run.storage import opened, url_of, without_password
+from sb3_htr.zoo.run.study import opened, url_of, without_password
 
 HELP = """sb3-htr optimize: rl_zoo3's `train -optimize` (its arguments follow) for methods of ours, with Optuna.
 

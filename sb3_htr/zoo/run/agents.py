@@ -17,9 +17,9 @@ from rl_zoo3.utils import get_wrapper_class
 from stable_baselines3.common.vec_env import VecEnv
 
 import htr_envs  # noqa: F401 registers the envs
+from sb3_htr.common.checkpoint import checkpoints, n_steps_done
 from sb3_htr.common.checks import check_device
 from sb3_htr.common.errors import last_line
-from sb3_htr.common.resume import checkpoints, n_steps_done
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.zoo.run.algorithm import Algorithm, Model
 from sb3_htr.zoo.run.folder import run_number

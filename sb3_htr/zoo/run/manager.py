@@ -36,9 +36,10 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
 from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.checkpoint import checkpoints, load_latest
+from sb3_htr.common.checkpoint_callback import CheckpointCallback, cut_monitor_files
 from sb3_htr.common.errors import WRITE_ERRORS, reason
 from sb3_htr.common.progress import MetaProgressBarCallback
-from sb3_htr.common.resume import CheckpointCallback, checkpoints, cut_monitor_files, load_latest
 from sb3_htr.common.settings import check_keywords, check_numbers, keywords_of
 from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
 from sb3_htr.common.versions import UNKNOWN_HARDWARE, differences, hardware, made_by
@@ -52,12 +53,12 @@ from sb3_htr.zoo.run.agents import RECORD, read_record
 from sb3_htr.zoo.run.algorithm import Algorithm
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback, ProgressCallback
 from sb3_htr.zoo.run.folder import SystemLock, claim, lock
-from sb3_htr.zoo.run.kinds import checked_kinds
 from sb3_htr.zoo.run.method import DEFAULT, get_method, merged, names_of
 from sb3_htr.zoo.run.shipped import find_hyperparams
-from sb3_htr.zoo.run.storage import check_is_there, opened
+from sb3_htr.zoo.run.study import check_is_there, opened
 from sb3_htr.zoo.run.train_arguments import given_arguments
 from sb3_htr.zoo.run.trust import PACKAGES, check_arguments, plain_settings, refuse
+from sb3_htr.zoo.run.yaml_checks import checked_kinds
 
 # What a YAML file may have beside the arguments of the algorithm
 ZOO_SETTINGS = ("n_envs", "n_timesteps", "env_wrapper", "vec_env_wrapper", "callback", "env_kwargs")

@@ -10,7 +10,7 @@ import yaml
 from sb3_htr.adaptation.explorers import EXPLORERS
 from sb3_htr.common.settings import check_numbers, keywords_of
 from sb3_htr.htr.relabel import RELABELLERS, TrainingTaskRelabelling
-from sb3_htr.rivals.base import OwnWay
+from sb3_htr.rivals.adaptation import OwnWay
 from sb3_htr.zoo.run.algorithm import ALGORITHMS, Algorithm, check_folder_name
 from sb3_htr.zoo.run.shipped import hyperparams_file
 

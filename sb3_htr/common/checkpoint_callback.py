@@ -1,4 +1,4 @@
-"""Checkpoints from which a training goes on as if it had never stopped."""
+"""Writes checkpoints from which a training goes on as if it had never stopped."""
 
 import io
 import re
@@ -6,7 +6,7 @@ import shutil
 import time
 import warnings
 from collections.abc import Sequence
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
@@ -16,14 +16,17 @@ from stable_baselines3.common.logger import TensorBoardOutputFormat
 
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.callback import parts_of
-from sb3_htr.common.checkpoint import DamagedCheckpoint, read_checkpoint, write_checkpoint
+from sb3_htr.common.checkpoint import (
+    CHECKPOINTS,
+    checkpoints,
+    n_steps_at,
+    write_checkpoint,
+)
 from sb3_htr.common.errors import WRITE_ERRORS, reason
 from sb3_htr.common.settings import check_numbers
 
 # What is recorded but not written yet
 LOGGER_STATE = ("name_to_value", "name_to_count", "name_to_excluded")
-# In the folder of a run
-CHECKPOINTS = "checkpoints"
 # Of a callback's attributes, those that are kept
 NUMBERS = (bool, int, float)
 
@@ -39,23 +42,6 @@ class HasState(Protocol):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over the result of ``state_dict``."""
         ...
-
-
-def checkpoints(run: Path) -> list[Path]:
-    """
-    :param run: folder of a run
-    :return: its checkpoints, the latest first
-    """
-    folders = [path for path in (run / CHECKPOINTS).glob("*_steps") if path.name.removesuffix("_steps").isdecimal()]
-    return sorted(folders, key=n_steps_at, reverse=True)
-
-
-def n_steps_at(checkpoint: PurePath) -> int:
-    """
-    :param checkpoint: folder
-    :return: env steps before it
-    """
-    return int(checkpoint.name.removesuffix("_steps"))
 
 
 def numbers_of(callback: BaseCallback) -> dict[str, Any]:
@@ -79,30 +65,6 @@ def restore_numbers(callback: BaseCallback, numbers: dict[str, Any]) -> None:
 
 def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
-
-
-def n_steps_done(run: Path) -> int:
-    """
-    :param run: folder of a run
-    :return: env steps before its latest checkpoint, 0 without one
-    """
-    return next(map(n_steps_at, checkpoints(run)), 0)
-
-
-def load_latest(run: Path) -> tuple[Path, dict[str, Any]]:
-    """
-    :param run: folder of a run
-    :return: the latest checkpoint that is whole, and its state; those that are not are warned of
-    :raises FileNotFoundError: if there is none
-    """
-    for folder in checkpoints(run):
-        try:
-            return folder, read_checkpoint(folder)
-        except DamagedCheckpoint as error:
-            warnings.warn(f"{error} The next older checkpoint is tried.", stacklevel=2)
-    raise FileNotFoundError(
-        f"There is no checkpoint to go on from in {run / 'checkpoints'}: move {run} away, and train again, with --save-freq."
-    )
 
 
 def cut_monitor_files(run: Path, folder: Path, sizes: dict[str, int]) -> None:
