@@ -31,7 +31,8 @@ from sb3_htr.htr.relabel import RELABELLERS, HindsightDraw
 from sb3_htr.pearl.encoder import ContextEncoder
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run import method
-from sb3_htr.zoo.run.agents import RECORD, agent_at
+from sb3_htr.zoo.run.agents import agent_at
+from sb3_htr.zoo.run.record import RECORD
 from sb3_htr.zoo.run.shipped import hyperparams_file
 
 # Annotations here are wide on purpose: these are somebody's own few lines.

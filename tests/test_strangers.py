@@ -24,8 +24,9 @@ from sb3_htr.common.checkpoint import MANIFEST, DamagedCheckpoint, checkpoints, 
 from sb3_htr.common.safe_load import load_plain
 from sb3_htr.zoo.cli import console, main
 from sb3_htr.zoo.commands.optimize import create_study
-from sb3_htr.zoo.run.agents import RECORD, agent_at, find_runs
+from sb3_htr.zoo.run.agents import agent_at, find_runs
 from sb3_htr.zoo.run.callbacks import ProgressCallback
+from sb3_htr.zoo.run.record import RECORD
 from sb3_htr.zoo.run.trust import check_arguments, plain_settings
 
 

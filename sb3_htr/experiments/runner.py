@@ -24,10 +24,11 @@ from sb3_htr.pearl.untrusted import EXPLORERS, check_is_ours
 from sb3_htr.rivals.base import Rival
 from sb3_htr.rivals.untrusted import plain_policy
 from sb3_htr.zoo.commands import train
-from sb3_htr.zoo.run.agents import RECORD, agent_at, file_stem, find_runs, is_finished, n_steps_of, read_record
+from sb3_htr.zoo.run.agents import agent_at, file_stem, find_runs, is_finished, n_steps_of
 from sb3_htr.zoo.run.algorithm import Model
 from sb3_htr.zoo.run.folder import SystemLock, run_number
 from sb3_htr.zoo.run.method import get_method, merged
+from sb3_htr.zoo.run.record import RECORD, read_record
 from sb3_htr.zoo.run.time_to_learned import seconds_at
 from sb3_htr.zoo.run.train_arguments import training_facts
 from sb3_htr.zoo.run.trust import import_packages

@@ -20,7 +20,7 @@ from sb3_htr.experiments.driver import Driver
 from sb3_htr.experiments.executors import Here, Ray
 from sb3_htr.experiments.grid import Experiment, Variant, by
 from sb3_htr.experiments.runner import find_finished, run_cell
-from sb3_htr.zoo.run.agents import RECORD
+from sb3_htr.zoo.run.record import RECORD
 
 SLOWER = {**OF_CELL, "gradient_steps": 20}
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from helpers import ENV_ID
 from sb3_htr import PEARL
-from sb3_htr.zoo.run.agents import RECORD
+from sb3_htr.zoo.run.record import RECORD
 from sb3_htr.zoo.run.shipped import shipped
 
 # For `-params`, in rollouts of 240 steps

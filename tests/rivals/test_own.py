@@ -32,7 +32,8 @@ from sb3_htr.rivals.untrusted import load_untrusted
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.commands.export import export
 from sb3_htr.zoo.run import algorithm, method
-from sb3_htr.zoo.run.agents import RECORD, TrainedAgent, agent_at
+from sb3_htr.zoo.run.agents import TrainedAgent, agent_at
+from sb3_htr.zoo.run.record import RECORD
 
 MODULE = "examples.plain_ppo"
 SMALL: dict[str, Any] = {"n_steps": 40, "batch_size": 40, "n_epochs": 1, "policy_kwargs": {"net_arch": [4]}}

@@ -25,7 +25,8 @@ from sb3_htr.experiments.grid import Variant
 from sb3_htr.zoo import cli
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run import model_card
-from sb3_htr.zoo.run.agents import RECORD, agent_at, agent_for
+from sb3_htr.zoo.run.agents import agent_at, agent_for
+from sb3_htr.zoo.run.record import RECORD
 from sb3_htr.zoo.run.shipped import shipped
 from sb3_htr.zoo.run.train_arguments import training_facts
 

@@ -8,7 +8,8 @@ import gymnasium as gym
 import pytest
 
 from sb3_htr.zoo.cli import main
-from sb3_htr.zoo.run.agents import RECORD, agent_at, agent_for
+from sb3_htr.zoo.run.agents import agent_at, agent_for
+from sb3_htr.zoo.run.record import RECORD
 
 
 def test_ids_with_a_namespace_name_files_as_rl_zoo3_does(tmp_path: Path) -> None:

@@ -17,8 +17,9 @@ from sb3_htr import PEARL
 from sb3_htr.adaptation import Belief, Prior
 from sb3_htr.adaptation.explorers import to_explorer
 from sb3_htr.zoo.cli import main
-from sb3_htr.zoo.run.agents import RECORD, agent_for
+from sb3_htr.zoo.run.agents import agent_for
 from sb3_htr.zoo.run.method import PEARLMethod, get_method, merged, methods, register_method
+from sb3_htr.zoo.run.record import RECORD
 from sb3_htr.zoo.run.shipped import hyperparams_file
 
 OWN = ["htr-ser", "htr-ec", "pearl-dense", "pearl-sparse", "htr-hfr", "htr-hipi"]

@@ -26,10 +26,10 @@ from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.commands import optimize, train
 from sb3_htr.zoo.run import search_space
-from sb3_htr.zoo.run.agents import RECORD
 from sb3_htr.zoo.run.algorithm import ALGORITHMS
 from sb3_htr.zoo.run.manager import MetaExperimentManager
 from sb3_htr.zoo.run.method import PEARLMethod, get_method, merged, methods
+from sb3_htr.zoo.run.record import RECORD
 from sb3_htr.zoo.run.study import absolute, without_password
 
 SMALL = ["-params", "n_tasks_per_rollout:4", "n_episodes_per_task:3", "learning_starts:240", "n_envs:4"]

@@ -18,9 +18,10 @@ from sb3_htr import evaluate_adaptation
 from sb3_htr.common.checks import get_max_episode_steps
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.zoo.cli import main
-from sb3_htr.zoo.run.agents import RECORD, TrainedAgent, agent_at
+from sb3_htr.zoo.run.agents import TrainedAgent, agent_at
 from sb3_htr.zoo.run.algorithm import ALGORITHMS
 from sb3_htr.zoo.run.method import methods
+from sb3_htr.zoo.run.record import RECORD
 
 SMALL: dict[str, list[str]] = {
     "rl2": [

@@ -25,11 +25,11 @@ from sb3_htr import PEARL
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.zoo.cli import main
-from sb3_htr.zoo.run.agents import RECORD, read_record
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback
 from sb3_htr.zoo.run.malloc import keep_freed_memory
 from sb3_htr.zoo.run.manager import MetaExperimentManager
 from sb3_htr.zoo.run.method import DEFAULT, get_method
+from sb3_htr.zoo.run.record import RECORD, read_record
 from sb3_htr.zoo.run.shipped import hyperparams_file
 
 

@@ -17,9 +17,10 @@ from sb3_htr.common.settings import keywords_of
 from sb3_htr.common.vec_env import N_ENVS
 from sb3_htr.rivals.base import Rival
 from sb3_htr.zoo.commands.arguments import add_agent_arguments, make_parser, parse
-from sb3_htr.zoo.run.agents import RECORD, TrainedAgent
+from sb3_htr.zoo.run.agents import TrainedAgent
 from sb3_htr.zoo.run.hub import CARD, FILM, files, model_name, push
 from sb3_htr.zoo.run.model_card import model_card, training_command
+from sb3_htr.zoo.run.record import RECORD
 
 EXAMPLE = """  sb3-htr export runs/htr-ser/SparsePointRobot-v0_1 -o my_agent
   sb3-htr export runs --film --push-to-hub USER                    as USER/pearl-SparsePointRobot-v0

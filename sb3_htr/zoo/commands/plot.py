@@ -19,7 +19,8 @@ from sb3_htr.zoo.commands.arguments import add_adaptation_arguments, add_agent_a
 from sb3_htr.zoo.plots.adaptation import plot_adaptation_curve, plot_adaptation_paths, start_position
 from sb3_htr.zoo.plots.curves import Curve, plot_curves
 from sb3_htr.zoo.plots.latent import plot_latent_space
-from sb3_htr.zoo.run.agents import RECORD, TrainedAgent, runs_with_models
+from sb3_htr.zoo.run.agents import TrainedAgent, runs_with_models
+from sb3_htr.zoo.run.record import RECORD
 from sb3_htr.zoo.run.time_to_learned import time_to_learned
 from sb3_htr.zoo.run.train_arguments import training_facts
 

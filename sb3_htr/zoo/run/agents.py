@@ -24,18 +24,12 @@ from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.zoo.run.algorithm import Algorithm, Model
 from sb3_htr.zoo.run.folder import run_number
 from sb3_htr.zoo.run.method import DEFAULT, OWN, get_method, methods
+from sb3_htr.zoo.run.record import MAX_RECORD, RECORD, read_record
 from sb3_htr.zoo.run.shipped import shipped
 from sb3_htr.zoo.run.trust import refuse
 
-# Record of a run: in its folder, and in an exported model file
-RECORD = "run.json"
-# Its bytes, at most
-MAX_RECORD = 2**20
 # rl_zoo3's, of single envs and of their batch
 WRAPPERS = ENV_WRAPPER, VEC_ENV_WRAPPER = "env_wrapper", "vec_env_wrapper"
-# What it must say, and what it may say for training on and for model cards
-REQUIRED = {"env_id": str, "env_kwargs": dict, "gym_packages": list}
-OF_TRAINING = {"arguments": list, "n_timesteps": int, "seed": int, "method": str, "hyperparams": dict, "hardware": list}
 
 
 @dataclass(frozen=True)
@@ -181,27 +175,6 @@ def is_finished(run: Path, env_id: str, n_timesteps: int) -> bool:
     # been removed
     done = n_steps_done(run)
     return n_steps_of(run, env_id) >= n_timesteps and (done >= n_timesteps or not done)
-
-
-def read_record(path: Path, content: bytes | None = None) -> dict[str, Any]:
-    """
-    :param path: of the record, or of the file that it is in
-    :param content: if it was read already
-    :return: the record of a run
-    :raises ValueError: if it is damaged
-    """
-    try:
-        record = json.loads(path.read_bytes() if content is None else content)
-        given = {name: kind for name, kind in OF_TRAINING.items() if name in record}
-        texts = *record["gym_packages"], *record.get("arguments", ()), *record.get("hardware", ())
-        code = record, *record.get("resumed_by", ())
-        kinds_are_right = all(type(record[name]) is kind for name, kind in {**REQUIRED, **given}.items())
-        kinds_are_right &= all(type(by.get("versions", {})) is dict for by in code)
-        if kinds_are_right and all(isinstance(text, str) for text in texts):
-            return cast(dict[str, Any], record)
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        pass
-    raise ValueError(f"{path} is damaged, or no record of a run: it must say env_id, env_kwargs and gym_packages.")
 
 
 def find_runs(folder: Path) -> list[Path]:

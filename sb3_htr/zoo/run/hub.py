@@ -7,9 +7,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.zoo.run.agents import RECORD, TrainedAgent, agent_at, file_stem
+from sb3_htr.zoo.run.agents import TrainedAgent, agent_at, file_stem
 from sb3_htr.zoo.run.folder import claim
 from sb3_htr.zoo.run.method import DEFAULT, methods
+from sb3_htr.zoo.run.record import RECORD
 
 CARD, FILM = "README.md", "replay.mp4"
 

@@ -3,7 +3,6 @@
 import argparse
 import contextlib
 import importlib
-import json
 import shlex
 import shutil
 import signal
@@ -35,25 +34,24 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
-from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checkpoint import checkpoints, load_latest
 from sb3_htr.common.checkpoint_callback import CheckpointCallback, cut_monitor_files
 from sb3_htr.common.errors import WRITE_ERRORS, reason
 from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.settings import check_keywords, check_numbers, keywords_of
 from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
-from sb3_htr.common.versions import UNKNOWN_HARDWARE, differences, hardware, made_by
+from sb3_htr.common.versions import hardware, made_by
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.pearl.horizon import timesteps_for
 from sb3_htr.pearl.pearl import PEARL
 from sb3_htr.pearl.policies import PEARLPolicy
 from sb3_htr.pearl.untrusted import load_untrusted
-from sb3_htr.zoo.run.agents import RECORD, read_record
 from sb3_htr.zoo.run.algorithm import Algorithm
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback, ProgressCallback
 from sb3_htr.zoo.run.folder import SystemLock, claim, lock
 from sb3_htr.zoo.run.method import DEFAULT, get_method, merged, names_of
+from sb3_htr.zoo.run.record import RECORD, read_record, record_going_on, write_record
 from sb3_htr.zoo.run.shipped import find_hyperparams
 from sb3_htr.zoo.run.study import check_is_there, opened
 from sb3_htr.zoo.run.train_arguments import given_arguments
@@ -312,7 +310,7 @@ class MetaExperimentManager(ExperimentManager):
             self._checkpointing.restore(cast(Any, model), self._checkpoint)
             done = model.num_timesteps
             if self._going_on is not None:  # not before: a run that is refused has the plan that it had
-                self._write_record(self._going_on)
+                write_record(Path(self.save_path), self._going_on)
         log_interval = {-1: 1}.get(self.log_interval, self.log_interval if self.log_interval > 0 else None)
         with contextlib.ExitStack() as on_failure, _soft_interrupt(self._checkpointing):
             assert self._lock is not None
@@ -426,29 +424,8 @@ class MetaExperimentManager(ExperimentManager):
         used = {**saved_hyperparams, "n_timesteps": self.n_timesteps}
         if self.resumed is not None:
             record = read_record(self.resumed / RECORD)
-            before, now = record["hyperparams"], json.loads(json.dumps(used, default=str))
-            is_longer = before["n_timesteps"] < now["n_timesteps"]
-            changed = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
-            if changed and not (is_longer and changed == ["n_timesteps"]):
-                raise ValueError(
-                    f"The hyperparameters {changed} have changed since {self.resumed} was begun: a run goes on with the "
-                    "settings that it has. Restore the YAML file, or begin a new run."
-                )
-            going_on = dict(record)
-            if (here := self._hardware()) not in (known := record.get("hardware", [UNKNOWN_HARDWARE])):
-                going_on["hardware"] = [*known, here]
-            if is_longer:
-                going_on |= {"n_timesteps": self.n_timesteps, "arguments": sys.argv[1:], "hyperparams": now}
-            # Defaults are of the code, so what is not in the hyperparameters may be another from here on
-            resumed_by, code = record.get("resumed_by", []), made_by()
-            if other := differences([record, *resumed_by][-1], code):
-                steps = self._checkpoint["model"]["counters"]["num_timesteps"]
-                going_on["resumed_by"] = [*resumed_by, {"from": steps, **code}]
-                warnings.warn(
-                    f"{self.resumed} goes on with other code ({', '.join(other)}), whose defaults may be others, so it need "
-                    "not end as it would have. Its run.json names both from now on.",
-                    stacklevel=2,
-                )
+            n_steps = self._checkpoint["model"]["counters"]["num_timesteps"]
+            going_on = record_going_on(record, self.resumed, used, sys.argv[1:], self._hardware(), n_steps)
             self._going_on = going_on if going_on != record else None
             return
         super()._save_config(saved_hyperparams)
@@ -466,14 +443,10 @@ class MetaExperimentManager(ExperimentManager):
             **made_by(),
             "hyperparams": used,
         }
-        self._write_record(run)
+        write_record(Path(self.save_path), run)
 
     def _hardware(self) -> str:
         return hardware(get_device(self.device))
-
-    def _write_record(self, record: dict[str, Any]) -> None:
-        with atomic_path(Path(self.save_path) / RECORD) as path:
-            path.write_text(json.dumps(record, indent=2, default=str))
 
 
 @contextlib.contextmanager
