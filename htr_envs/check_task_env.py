@@ -291,9 +291,13 @@ def _check_sparse(family: TaskFamily, traj: Trajectory, own_tasks: FloatArray) -
         f"The sparse reward of an unsuccessful step is not 0 (beside task_free_reward) but {more:.2g}, which leaks the task: "
     )
     _require(more <= ROUNDING, leak + "compute_reward is what the task pays plus traj.task_free_reward.")
-    worth = task_rewards[np.arange(len(own_tasks)), np.arange(len(own_tasks))]
-    enough = bool((worth > failures.max() + ROUNDING).all())
-    _require(enough, "A step that solves its task exactly is worth no more than a failure.")
+    least = float(task_rewards[family.is_success(traj, tasks)].min())
+    unpaid = (
+        f"A step that solves a task, by is_success, is worth {least:.1g} (beside task_free_reward), no more than a failure: "
+    )
+    _require(
+        least > failures.max() + ROUNDING, unpaid + "compute_reward must pay for each success, and is_success ask for it."
+    )
 
 
 def _check_no_leak(plain: Episode, other: Episode) -> None:
@@ -427,6 +431,8 @@ def _check_batch(batch: Any, env: gym.Env[Any, Any], family: TaskFamily, seed: i
     options = {"task_id": np.zeros(batch.num_envs, dtype=np.int64)}
     others = [env.action_space.high] * (batch.num_envs - 1)  # type: ignore[attr-defined]
     observations, _ = _call("The batch of the id fails in a reset.", lambda: batch.reset(seed=seed, options=options))
+    finite = bool(np.isfinite(observations).all())
+    _require(finite, "The batch of the id begins with an observation that is not finite: see its _reset_state.")
     if not _same(observations[0], episode.traj.observations[0]):
         return  # starts that are drawn in another way: nothing can be compared
     for action, expected, reward in zip(episode.traj.actions, episode.traj.next_observations, episode.rewards, strict=True):

@@ -19,6 +19,13 @@ from numpy.typing import ArrayLike, NDArray
 FloatArray = NDArray[np.float32]
 
 
+def _float_array(name: str, tasks: ArrayLike) -> FloatArray:
+    try:
+        return np.array(tasks, dtype=np.float32)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} is no array of numbers: pass rows of equal length, shape (n, task_dim).") from None
+
+
 class TaskDistribution(ABC):
     """A distribution of tasks and three fixed sets of them: small, picklable, stateless.
 
@@ -26,21 +33,30 @@ class TaskDistribution(ABC):
     :param train_tasks: tasks to meta-train on, shape (n, task_dim).
     :param validation_tasks: tasks to choose hyper-parameters and checkpoints on, shape (n, task_dim).
     :param test_tasks: tasks to report results on, shape (n, task_dim).
-    :raises ValueError: if an array has the wrong shape, leaves ``task_space``, or shares a task with another.
+    :raises ValueError: if the space is no box of one axis, or an array is not made of numbers, has the wrong shape, leaves the
+        space, or shares a task with another.
     """
 
     def __init__(
         self, task_space: spaces.Box, train_tasks: ArrayLike, validation_tasks: ArrayLike, test_tasks: ArrayLike
     ) -> None:
+        if not isinstance(task_space, spaces.Box) or len(task_space.shape) != 1:
+            raise ValueError(f"task_space is {task_space}, expected a Box of one axis, shape (task_dim,): tasks are vectors.")
         self.task_space = task_space
-        self.train_tasks: FloatArray = np.array(train_tasks, dtype=np.float32)
-        self.validation_tasks: FloatArray = np.array(validation_tasks, dtype=np.float32)
-        self.test_tasks: FloatArray = np.array(test_tasks, dtype=np.float32)
+        self.train_tasks = _float_array("train_tasks", train_tasks)
+        self.validation_tasks = _float_array("validation_tasks", validation_tasks)
+        self.test_tasks = _float_array("test_tasks", test_tasks)
         self._freeze()
         seen: set[bytes] = set()
         for name, tasks in self._task_sets().items():
             if tasks.ndim != 2 or len(tasks) == 0:
                 raise ValueError(f"{name} has shape {tasks.shape}, expected (n, task_dim): pass at least one task.")
+            if tasks.shape[1:] != task_space.shape:
+                raise ValueError(
+                    f"{name} has shape {tasks.shape}, expected (n, {task_space.shape[0]}): a row is a task of {task_space}."
+                )
+            if not np.isfinite(tasks).all():
+                raise ValueError(f"{name} has NaN or infinity, expected finite numbers.")
             if not all(task_space.contains(task) for task in tasks):
                 raise ValueError(f"{name} holds a task that is not in {task_space}: widen the space or move it.")
             # adding 0.0 turns -0.0 into 0.0, the same task with other bytes
@@ -278,10 +294,10 @@ class MetaEnv(HasTaskFamily, gym.Env[FloatArray, FloatArray], ABC):
             raise ResetNeeded("step was called before the first reset: call env.reset() first.")
         action = checked_action(action, self.action_space)
         stepped = self._step_state(action)
-        if len(stepped) != 3:
+        if not isinstance(stepped, tuple) or len(stepped) != 3:
+            got = f"{len(stepped)} values" if isinstance(stepped, tuple) else f"a {type(stepped).__name__}"
             raise ValueError(
-                "_step_state must return an observation, a reward and whether the episode terminates, got "
-                f"{len(stepped)} values."
+                f"_step_state must return an observation, a reward and whether the episode terminates, got {got}."
             )
         state, reward, terminated = stepped
         if np.ndim(reward):

@@ -144,7 +144,11 @@ class TaskVectorEnv(HasTaskFamily, VectorEnv[FloatArray, FloatArray, NDArray[Any
         self._task_ids[indices] = np.where(given, self._given_ids[indices], drawn)
         self._tasks[indices] = np.where(given[:, None], self._given_tasks[indices], self.task_family.train_tasks[drawn])
         self._elapsed_steps[indices] = 0
-        observations[indices] = self._reset_state(indices)
+        states, expected = self._reset_state(indices), (len(indices), *observations.shape[1:])
+        if states is None or np.shape(states) != expected:
+            what = "nothing" if states is None else f"shape {np.shape(states)}"
+            raise ValueError(f"_reset_state returned {what}, expected {expected}: a first observation for each of `indices`.")
+        observations[indices] = states
 
     def step(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
         """Do one step in every copy, and reset those that it finishes.
@@ -157,14 +161,15 @@ class TaskVectorEnv(HasTaskFamily, VectorEnv[FloatArray, FloatArray, NDArray[Any
         if self._observations is None:
             raise ResetNeeded("step was called before the first reset: call reset() first.")
         actions = checked_action(actions, self.action_space)
-        states, task_free_reward, terminated = self._step_state(actions)
-        given = tuple(map(np.shape, (states, task_free_reward, terminated)))
+        stepped = self._step_state(actions)
+        given = tuple(map(np.shape, stepped)) if isinstance(stepped, tuple) else f"a {type(stepped).__name__}"
         expected = (self._observations.shape, (self.num_envs,), (self.num_envs,))
         if given != expected:
             raise ValueError(
                 "_step_state returns observations, task-free rewards and terminations, one of each for each env: expected "
                 f"arrays of the shapes {expected}, got {given}."
             )
+        states, task_free_reward, terminated = stepped
         task_free_reward, terminated = np.asarray(task_free_reward), np.asarray(terminated)
         if terminated.dtype != np.bool_:
             raise ValueError(

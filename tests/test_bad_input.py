@@ -854,6 +854,27 @@ def test_a_hindsight_task_that_its_step_does_not_solve_is_named(
         tiny_pearl(env).learn(ROLLOUT)
 
 
+def test_a_success_that_pays_nothing_is_named(tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Exact hindsight tasks do pay, and own tasks are seldom solved."""
+    near = PointRobotFamily(goal_radius=0.02)
+    reward = PointRobotFamily.compute_reward
+    monkeypatch.setattr(
+        PointRobotFamily, "compute_reward", lambda self, traj, task, kind="sparse": reward(near, traj, task, kind)
+    )
+    with pytest.raises(ValueError, match=r"\d+ steps solve a task that was reached, by is_success, and are worth nothing"):
+        tiny_pearl().learn(ROLLOUT)
+
+
+def test_a_task_that_is_none_costs_no_reset(tiny_pearl: MakePEARL) -> None:
+    """Whoever mends a slip goes on with the same env."""
+    model, env = tiny_pearl(), gym.make(ENV_ID)
+    with pytest.raises(ValueError, match=r"The task has shape \(3,\), expected \(2,\)"):
+        model.adapt(env, n_episodes=1, task=np.zeros(3))
+    with pytest.raises(ValueError, match="task id 500 is out of range"):
+        model.adapt(env, n_episodes=1, task=500)
+    model.adapt(env, n_episodes=1, task=np.array([0.0, 1.0]))
+
+
 def test_a_hindsight_task_of_nan_is_named(tiny_pearl: MakePEARL) -> None:
     """And no wrapper is blamed."""
 

@@ -208,8 +208,8 @@ def check_has_hooks(family: TaskFamily) -> None:
     if (missing := missing_hook(family)) is not None:
         raise ValueError(
             f"The env's task_family has no {missing}, which hindsight relabelling and dense proxy rewards need: "
-            f"{TASK_ENV_ADVICE}, or train plain PEARL, with replay_buffer_kwargs={{'relabel_probability': 0}}, "
-            "explorer='prior' and train_explorer='prior'."
+            f"{TASK_ENV_ADVICE}, or train plain PEARL, on the command line --method pearl-sparse-prior, in Python "
+            "replay_buffer_kwargs={'relabel_probability': 0}, explorer='prior' and train_explorer='prior'."
         )
 
 

@@ -42,6 +42,7 @@ def check_reward_hook(
     solved = successes[:, 0]
     check_rewards_told(given, computed, task)
     _check_whole_episodes(family, columns, episodes[:MAX_WHOLE], computed, solved)
+    _check_every_success(family, columns, episodes[:MAX_WHOLE])
     _check_worth(family, columns, np.stack([episode[-1] for _, episode in episodes]))
     # What is more than rounding is a success to all that learns from it
     beside = np.maximum(*(np.abs(reward - traj.task_free_reward[:, 0]) for reward in (given, computed)))
@@ -120,6 +121,21 @@ def _check_whole_episodes(
                     f"{name} of a whole episode differs from {name} of its steps one by one: it must tell of each step alone, "
                     "whatever was before. Run htr_envs.check_task_env(env) to find out more."
                 )
+
+
+def _check_every_success(family: TaskFamily, columns: Transitions, episodes: Sequence[tuple[int, np.ndarray]]) -> None:
+    """Under a task that was reached, as few are solved of one's own at first: what success asks for, rewards must pay."""
+    for _, episode in episodes:
+        traj = columns.trajectory(episode[None])
+        reached = family.hindsight_task(traj, len(episode) - 1)
+        check_achieved(reached)
+        worth = task_reward(family.compute_reward(traj, reached), traj.task_free_reward)
+        unpaid = np.asarray(family.is_success(traj, reached)) & (worth <= 0)
+        if unpaid.any():
+            raise ValueError(
+                f"{int(unpaid.sum())} steps solve a task that was reached, by is_success, and are worth nothing beside their "
+                "task-free reward, by compute_reward: pay for each success, or have is_success ask for what is paid."
+            )
 
 
 def _check_worth(family: TaskFamily, columns: Transitions, last: np.ndarray) -> None:

@@ -266,8 +266,8 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
     def _check_explorer(explorer: Explorer, tells_success: bool) -> None:
         if explorer.needs_success and not tells_success:
             raise ValueError(
-                f"The explorer {explorer.name!r} goes by successes, of which the env's task_family tells nothing: pass "
-                "explorer='prior' and train_explorer='prior'."
+                f"The explorer {explorer.name!r} goes by successes, of which the env's task_family tells nothing: choose "
+                "'prior' (in a training as explorer and train_explorer, on the command line by --method pearl-sparse-prior)."
             )
 
     @staticmethod
@@ -565,6 +565,12 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
                 task = np.array(vec_env.get_attr("task")[0] if has_vector else vec_env.unwrapped.reset_infos[0]["task_id"])
             if np.ndim(task) == 0 and not np.issubdtype(np.asarray(task).dtype, np.integer):
                 raise ValueError(f"task is {task!r}: pass the index of a training task, or a task as a vector, [{task!r}].")
+            # Before the env has it: after a reset that failed, an env without a first observation would be stepped
+            family = checks.get_task_family(vec_env)
+            if np.ndim(task) == 0 and hasattr(family, "task_indices"):
+                family.task_indices(task, ())
+            elif np.ndim(task) > 0 and hasattr(family, "task_vectors"):
+                family.task_vectors(task, family.train_tasks.shape[1:])
             vec_env.set_options({"task_id": int(task)} if np.ndim(task) == 0 else {"task": np.asarray(task, dtype=np.float32)})
         elif task is not None:
             raise ValueError("The env has no task family, so it takes no task: leave task out, and set its task yourself.")

@@ -55,13 +55,20 @@ class TaskHerReplayBuffer(HerReplayBuffer):
         """
         Store one step of each env; arguments are SB3's.
 
-        :raises ValueError: if the reward hook disagrees with what the env gave
+        :raises ValueError: if the reward hook disagrees with what the env gave, or a step does not solve the task that it
+            achieves
         """
         assert isinstance(self.env, ShownTaskVecEnv) and isinstance(self.action_space, spaces.Box)
         task_free = np.array([info.get("task_free_reward", 0.0) for info in infos], dtype=np.float32)
         columns = obs["observation"], unscaled(action, self.action_space), next_obs["observation"], task_free
         step = Trajectory(*(values[:, None] for values in columns))
-        check_rewards_told(reward, self.env.shown.family.compute_reward(step, obs["desired_goal"])[:, 0], obs["desired_goal"])
+        family = self.env.shown.family
+        check_rewards_told(reward, family.compute_reward(step, obs["desired_goal"])[:, 0], obs["desired_goal"])
+        if not family.is_success(step, next_obs["achieved_goal"]).all():
+            raise ValueError(
+                f"hindsight_task of {type(family).__name__} names a task that its own step does not solve, by is_success: HER "
+                "would teach what did not happen. Run htr_envs.check_task_env(env) to find out more."
+            )
         super().add(obs, next_obs, action, reward, done, infos)
 
     def _get_virtual_samples(

@@ -261,3 +261,62 @@ def test_a_family_needs_no_dense_proxy() -> None:
 @pytest.mark.parametrize(("broken", "sentence"), BROKEN)
 def test_a_broken_promise_is_named(broken: Any, sentence: str) -> None:
     assert_refused(broken() if issubclass(broken, LineEnv) else LineEnv(broken()), sentence)
+
+
+# ---------------------------------------------------------------- mistakes of whoever writes a family
+
+
+@pytest.mark.parametrize(
+    ("space", "train_tasks", "sentence"),
+    [
+        (spaces.Box(-3, 3, (1,)), [[0.0, 1.0]], r"train_tasks has shape \(1, 2\), expected \(n, 1\)"),
+        (spaces.Box(-3, 3, (1,)), [[np.nan]], "train_tasks has NaN or infinity"),
+        (spaces.Box(-3, 3, (1,)), [["a"]], "train_tasks is no array of numbers"),
+        (spaces.Box(-3, 3, (1,)), [[0.0], [1.0, 2.0]], "train_tasks is no array of numbers"),
+        (spaces.Box(-3, 3, (1,)), [[4.0]], "train_tasks holds a task that is not in Box"),
+        (spaces.Box(-3, 3, ()), [[0.0]], r"task_space is Box\(.*\), expected a Box of one axis"),
+        (spaces.Discrete(3), [[0.0]], r"task_space is Discrete\(3\), expected a Box of one axis"),
+        ([-3, 3], [[0.0]], r"task_space is \[-3, 3\], expected a Box of one axis"),
+    ],
+)
+def test_tasks_that_are_none_are_named(space: Any, train_tasks: Any, sentence: str) -> None:
+    class Family(LineFamily):
+        def __init__(self) -> None:
+            super(LineFamily, self).__init__(space, train_tasks, [[1.5]], [[-1.5]])
+
+    with pytest.raises(ValueError, match=sentence):
+        Family()
+
+
+def test_hooks_that_return_nothing_are_named() -> None:
+    class NoReturn(LineEnv):
+        def _step_state(self, action: Any) -> Any:
+            super()._step_state(action)
+
+    env = NoReturn()
+    env.reset()
+    with pytest.raises(ValueError, match=r"_step_state must return .* got a NoneType"):
+        env.step(env.action_space.sample())
+
+
+@pytest.mark.parametrize(
+    ("states", "what"), [(None, "nothing"), (np.zeros((1, 2), dtype=np.float32), r"shape \(1, 2\)")], ids=["none", "one row"]
+)
+def test_a_batch_that_begins_with_other_observations_is_named(states: Any, what: str) -> None:
+    class OtherStarts(PointRobotVectorEnv):
+        def _reset_state(self, indices: Any) -> Any:
+            return states
+
+    with pytest.raises(ValueError, match=f"_reset_state returned {what}, expected \\(3, 2\\)"):
+        OtherStarts(3).reset()
+
+
+def test_a_batch_whose_step_returns_nothing_is_named() -> None:
+    class NoReturn(PointRobotVectorEnv):
+        def _step_state(self, actions: Any) -> Any:
+            super()._step_state(actions)
+
+    env = NoReturn(3)
+    env.reset()
+    with pytest.raises(ValueError, match=r"_step_state returns observations, .* got a NoneType"):
+        env.step(env.action_space.sample())

@@ -145,6 +145,15 @@ def test_tasks_that_a_state_does_not_tell_are_refused(monkeypatch: pytest.Monkey
         tiny_sac_her().learn(80)
 
 
+def test_goals_that_their_state_does_not_solve_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    def beside(self: Any, traj: Any, index: Any) -> np.ndarray:
+        return np.asarray(traj.next_observations[..., index, :] + 1, dtype=np.float32)
+
+    monkeypatch.setattr(PointRobotFamily, "hindsight_task", beside)
+    with pytest.raises(ValueError, match="hindsight_task of PointRobotFamily names a task that its own step does not solve"):
+        tiny_sac_her().learn(80)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
