@@ -120,6 +120,13 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     where.add_argument("--cell", type=int, metavar="I", help="run number I alone, from 0, for job arrays; writes no results")
     where.add_argument("--finished", action="store_true", help="train nothing: results of the runs that are finished")
     args = parser.parse_args(argv)
+    for name in args.names:
+        experiment = grid.EXPERIMENTS[name]
+        if experiment.name != name or not experiment.variants:
+            raise ValueError(
+                f'EXPERIMENTS["{name}"] is an Experiment named {experiment.name!r} with {len(experiment.variants)} variants: '
+                "expected the same name, which its folders and commands have, and at least one variant."
+            )
     given = {"--seeds": args.seeds, "--jobs": args.jobs}
     check_numbers(**{name: (n, 1) for name, n in given.items() if n is not None})
     if not args.ray:  # whose nodes may have others

@@ -50,6 +50,22 @@ def evaluate(
     return {**arrays, "calibration": calibration(model, cell.env_id, cell.env_kwargs, cell.n_episodes)}
 
 
+def check_evaluations(cell: Cell, trained_with: Any = None) -> None:
+    """
+    Before a training, at whose end it would be said hours later.
+
+    :param cell: says which evaluations
+    :param trained_with: explorer as the hyperparameters of its training give it
+    :raises ValueError: for an explorer or arguments of the env that there are not
+    """
+    for evaluation in cell.evaluations:
+        try:
+            _explorer(evaluation.explorer, trained_with)
+            make_task_vec_env(cell.env_id, env_kwargs={**cell.env_kwargs, **evaluation.tested_on}).close()
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"{cell.label} could not be evaluated by {evaluation.name!r}: {error}") from None
+
+
 def _evaluate_by(evaluation: Evaluation, cell: Cell, model: Model, trained_with: Any) -> KwArgs:
     env_kwargs = {**cell.env_kwargs, **evaluation.tested_on}
     family = get_task_family(make_task_vec_env(cell.env_id, env_kwargs=env_kwargs))

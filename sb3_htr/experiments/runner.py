@@ -19,7 +19,7 @@ from sb3_htr.common.versions import UNKNOWN_HARDWARE, commit, hardware, named, v
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.evaluation_cache import FOLDER, Kept, digest_of_code
 from sb3_htr.experiments.log import logged
-from sb3_htr.experiments.protocol import evaluate
+from sb3_htr.experiments.protocol import check_evaluations, evaluate
 from sb3_htr.pearl.untrusted import EXPLORERS, check_is_ours
 from sb3_htr.rivals.base import Rival
 from sb3_htr.rivals.untrusted import plain_policy
@@ -108,6 +108,7 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
     trained = find_finished(cell, folder)
     if trained is None:
         _check_loadable(cell)
+        check_evaluations(cell, hyperparams_of(cell).get("explorer"))
         numbered = sorted(folder.glob("*/*"), key=lambda run: run_number(run, file_stem(cell.env_id)))
         unfinished = [run for run in numbered if checkpoints(run)]
         packages = ["--gym-packages", *cell.gym_packages] if cell.gym_packages else []

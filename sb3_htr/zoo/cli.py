@@ -5,12 +5,16 @@ import importlib
 import os
 import select
 import sys
+import sysconfig
+import traceback
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TextIO
 
 import gymnasium
 import torch as th
 
+import sb3_htr
 from sb3_htr.common.versions import versions
 
 COMMANDS = {
@@ -112,6 +116,14 @@ def _is_closed(stream: TextIO) -> bool:
     return any(event & select.POLLERR for _, event in poll.poll(0))
 
 
+def _where(error: Exception) -> str:
+    """The last place on the way to an error that is in no installed package: a bug in an env may show up after hours."""
+    installed = sysconfig.get_path("purelib"), sysconfig.get_path("stdlib"), str(Path(sb3_htr.__file__).parent)
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if frame.filename.endswith(".py") and not frame.filename.startswith(installed)]
+    return "".join(f" ({frame.filename}, line {frame.lineno}, in {frame.name})" for frame in own[-1:])
+
+
 def console() -> int:
     """
     :return: exit status of :func:`main`; 1 and a sentence, without the way to it, for an error; 130 after Ctrl-C
@@ -129,8 +141,8 @@ def console() -> int:
             return 1
         if os.environ.get("SB3_HTR_TRACEBACK"):
             raise
-        name = "" if isinstance(error, MISTAKES) else f"{type(error).__name__}: "
-        print(f"sb3-htr: {name}{error}\n(SB3_HTR_TRACEBACK=1 in the environment shows where this comes from)", file=sys.stderr)
+        said = str(error) if isinstance(error, MISTAKES) else f"{type(error).__name__}: {error}{_where(error)}"
+        print(f"sb3-htr: {said}\n(SB3_HTR_TRACEBACK=1 in the environment shows where this comes from)", file=sys.stderr)
         return 1
     finally:
         _nobody_reads()

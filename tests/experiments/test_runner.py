@@ -44,6 +44,32 @@ def refuse(*_: Any, **__: Any) -> None:
     raise AssertionError("a finished run is not trained again")
 
 
+@pytest.mark.parametrize(
+    ("evaluations", "message"),
+    [
+        (by(("beleif",)), r"could not be evaluated by 'beleif': explorer is 'beleif', expected one of"),
+        (by(("belief",), {"goal_raduis": 0.3}), r"could not be evaluated by 'belief goal_raduis=0\.3': .*'goal_raduis'"),
+    ],
+)
+def test_what_could_not_be_evaluated_is_not_trained(
+    evaluations: Any, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train, "main", refuse)
+    variant = Variant("htr-ser", "tiny", OF_CELL)
+    (cell,) = Experiment("one", "", ENV_ID, 1200, (variant,), 1, evaluations=evaluations).cells()
+    with pytest.raises(ValueError, match=message):
+        run_cell(cell, tmp_path)
+
+
+@pytest.mark.parametrize(("name", "variants"), [("other", (Variant("htr-ser"),)), ("one", ())])
+def test_an_experiment_has_the_name_that_it_is_called_by(
+    name: str, variants: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setitem(grid.EXPERIMENTS, "one", Experiment(name, "", ENV_ID, 1200, variants))
+    with pytest.raises(ValueError, match=r'EXPERIMENTS\["one"\] is an Experiment named .* expected the same name'):
+        main(["experiment", "one", "--runs", str(tmp_path)])
+
+
 def test_of_two_unfinished_runs_the_newer_one_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (cell,) = Experiment("one", "", ENV_ID, 1200, (Variant("htr-ser", "tiny", OF_CELL),), 1).cells()
     runs = [cell.run_folder(tmp_path) / cell.method / f"{ENV_ID}_{number}" for number in (9, 10)]

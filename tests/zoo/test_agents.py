@@ -361,6 +361,29 @@ def test_the_console_answers_mistakes_in_one_sentence(
     assert cli.console() == 130 and "stopped" in capsys.readouterr().err
 
 
+BUGGY = """
+import gymnasium
+import htr_envs
+
+class Buggy(htr_envs.PointRobotEnv):
+    def _step_state(self, action):
+        return self.sped
+
+gymnasium.register("Buggy-v0", Buggy, max_episode_steps=20)
+"""
+
+
+def test_the_console_says_where_an_env_is_broken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It may show up after hours, and a second run for a traceback would take as long."""
+    (tmp_path / "buggy.py").write_text(BUGGY)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["sb3-htr", "train", "--env", "Buggy-v0", "--gym-packages", "buggy"])
+    assert cli.console() == 1
+    assert re.search(r"AttributeError: .*'sped' \(.*buggy\.py, line 7, in _step_state\)\n", capsys.readouterr().err)
+
+
 @pytest.mark.parametrize("command", cli.COMMANDS)
 def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_:

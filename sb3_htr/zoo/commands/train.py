@@ -2,7 +2,6 @@
 
 import argparse
 import difflib
-import shlex
 import traceback
 from collections.abc import Sequence
 from itertools import pairwise
@@ -16,7 +15,7 @@ from sb3_htr.zoo.run.agents import find_run, is_finished, n_steps_of
 from sb3_htr.zoo.run.malloc import keep_freed_memory
 from sb3_htr.zoo.run.manager import run_rl_zoo
 from sb3_htr.zoo.run.method import DEFAULT, get_method, methods
-from sb3_htr.zoo.run.record import OF_TRAINING, RECORD, read_record
+from sb3_htr.zoo.run.record import OF_TRAINING, RECORD, command_to_go_on, read_record
 from sb3_htr.zoo.run.study import absolute
 from sb3_htr.zoo.run.train_arguments import default_arguments, given_arguments, spelled_out, value_of
 from sb3_htr.zoo.run.trust import CONF, WEIGHTS, check_arguments, import_packages, see_working_folder
@@ -86,7 +85,7 @@ def main(argv: Sequence[str]) -> None:
         planned = record["n_timesteps"] + further.n_timesteps
         if is_finished(run, record["env_id"], planned):
             done = n_steps_done(run)
-            to_go_on = shlex.join(["sb3-htr", "train", "--resume", str(run), "-n", str(done - record["n_timesteps"] + 1)])
+            to_go_on = f"{command_to_go_on(run, record)} -n {done - record['n_timesteps'] + 1}"
             further_on = f"To train further, by so many steps or more: {to_go_on}"
             print(
                 f"{run} is finished, after {n_steps_of(run, record['env_id']):,} env steps. "

@@ -4,7 +4,6 @@ import contextlib
 import difflib
 import json
 import os
-import shlex
 import sys
 import zipfile
 from collections.abc import Callable
@@ -24,7 +23,7 @@ from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.zoo.run.algorithm import Algorithm, Model
 from sb3_htr.zoo.run.folder import run_number
 from sb3_htr.zoo.run.method import DEFAULT, OWN, get_method, methods
-from sb3_htr.zoo.run.record import MAX_RECORD, RECORD, read_record
+from sb3_htr.zoo.run.record import MAX_RECORD, RECORD, command_to_go_on, read_record
 from sb3_htr.zoo.run.shipped import shipped
 from sb3_htr.zoo.run.trust import refuse
 
@@ -226,8 +225,8 @@ def find_model(run: Path, env_id: str, which: str) -> Path:
     for path in (best, last) if which == "best" else (last, best):
         if path.exists():
             return path
-    resume = shlex.join(["sb3-htr", "train", "--resume", str(run)])
-    advice = f"go on with `{resume}`" if checkpoints(run) else "train anew, as it has no checkpoint either"
+    to_go_on = command_to_go_on(run, read_record(run / RECORD))
+    advice = f"go on with `{to_go_on}`" if checkpoints(run) else "train anew, as it has no checkpoint either"
     raise FileNotFoundError(f"{run} has no model yet, the first is saved with the first evaluation: {advice}.")
 
 

@@ -3,7 +3,6 @@
 import argparse
 import contextlib
 import importlib
-import shlex
 import shutil
 import signal
 import sys
@@ -51,11 +50,11 @@ from sb3_htr.zoo.run.algorithm import Algorithm
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback, ProgressCallback
 from sb3_htr.zoo.run.folder import SystemLock, claim, lock
 from sb3_htr.zoo.run.method import DEFAULT, get_method, merged, names_of
-from sb3_htr.zoo.run.record import RECORD, read_record, record_going_on, write_record
+from sb3_htr.zoo.run.record import RECORD, command_to_go_on, read_record, record_going_on, write_record
 from sb3_htr.zoo.run.shipped import find_hyperparams
 from sb3_htr.zoo.run.study import check_is_there, opened
 from sb3_htr.zoo.run.train_arguments import given_arguments
-from sb3_htr.zoo.run.trust import PACKAGES, check_arguments, plain_settings, refuse
+from sb3_htr.zoo.run.trust import check_arguments, plain_settings, refuse
 from sb3_htr.zoo.run.yaml_checks import checked_kinds
 
 # What a YAML file may have beside the arguments of the algorithm
@@ -336,8 +335,7 @@ class MetaExperimentManager(ExperimentManager):
             on_failure.pop_all()
 
     def _to_go_on(self) -> str:
-        packages = [name for name in self.args.gym_packages if name not in PACKAGES]
-        named = ["--gym-packages", *packages] if packages else []
+        packages = self.args.gym_packages
         record = read_record(Path(self.save_path) / RECORD)
         trust = self.trust
         try:
@@ -345,7 +343,7 @@ class MetaExperimentManager(ExperimentManager):
             plain_settings(self._given, RECORD, trust, packages)
         except ValueError:  # what a user may say, the record may not
             trust = True
-        return shlex.join(["sb3-htr", "train", "--resume", self.save_path, *named, *["--trust"] * trust])
+        return command_to_go_on(Path(self.save_path), record, trust)
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
         if self.trust:

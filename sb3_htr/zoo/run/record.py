@@ -1,12 +1,14 @@
 """The record of a run: what it was begun with, and by which code and on which machines it went on."""
 
 import json
+import shlex
 import warnings
 from pathlib import Path
 from typing import Any, cast
 
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.versions import UNKNOWN_HARDWARE, differences, made_by
+from sb3_htr.zoo.run.trust import PACKAGES
 
 # Record of a run: in its folder, and in an exported model file
 RECORD = "run.json"
@@ -38,6 +40,18 @@ def read_record(path: Path, content: bytes | None = None) -> dict[str, Any]:
     raise ValueError(f"{path} is damaged, or no record of a run: it must say env_id, env_kwargs and gym_packages.")
 
 
+def command_to_go_on(run: Path, record: dict[str, Any], trust: bool = False) -> str:
+    """
+    :param run: folder
+    :param record: of it
+    :param trust: whether its files have to be trusted
+    :return: the command that goes on with it, to be copied
+    """
+    packages = [name for name in record["gym_packages"] if name not in PACKAGES]
+    named = ["--gym-packages", *packages] if packages else []
+    return shlex.join(["sb3-htr", "train", "--resume", str(run), *named, *["--trust"] * trust])
+
+
 def write_record(run: Path, record: dict[str, Any]) -> None:
     """
     :param run: folder
@@ -64,7 +78,9 @@ def record_going_on(
     before, now = record["hyperparams"], json.loads(json.dumps(hyperparams, default=str))
     is_longer = before["n_timesteps"] < now["n_timesteps"]
     changed = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
-    if changed and not (is_longer and changed == ["n_timesteps"]):
+    if is_longer:
+        changed.remove("n_timesteps")
+    if changed:
         raise ValueError(
             f"The hyperparameters {changed} have changed since {run} was begun: a run goes on with the settings that it has. "
             "Restore the YAML file, or begin a new run."
