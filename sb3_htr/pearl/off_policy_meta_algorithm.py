@@ -168,7 +168,6 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
             # Loaded for prediction only: SB3 wants a buffer, we want no memory of it
             self.replay_buffer = ReplayBuffer(1, self.observation_space, self.action_space)  # type: ignore[assignment]
         else:
-            self._check_rollouts()
             self._take_replay(*self._make_replay(self.env))
         with warnings.catch_warnings():
             # SB3 does not know that this buffer has them
@@ -359,7 +358,18 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         )
         if total_timesteps > 0:
             checks.warn_without_updates(self, n_updates)
+            self._warn_without_successes()
         return self
+
+    def _warn_without_successes(self) -> None:
+        assert self.replay_buffer is not None and self.task_bank is not None
+        is_over = self._n_updates > 0 and self.num_timesteps >= self._total_timesteps
+        if is_over and self.replay_buffer.tells_rewards and self.task_bank.n_train_solved == 0:
+            warnings.warn(
+                "No episode of this training would have solved one of the training tasks, so they were not learnt: train "
+                f"longer than {self.num_timesteps} env steps, or see what is_success asks for.",
+                stacklevel=3,
+            )
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         return super()._init_callback(followed_by(callback, MetaProgressBarCallback()) if progress_bar else callback)
@@ -372,6 +382,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
                 "load_replay_buffer brings back what save_replay_buffer has saved.",
                 stacklevel=5,
             )
+        self._check_rollouts()
         # The weights of a file may be of a family without successes
         self.knowledge.set_tells_success(self.replay_buffer.tells_rewards)
         return super()._setup_learn(*args, **kwargs)

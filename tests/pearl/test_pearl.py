@@ -393,10 +393,19 @@ def test_rollouts_that_never_act_by_what_they_inferred_are_warned_of(
     explorer = {"name": "learned-prior", "n_exploration_episodes": n_exploration}
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        tiny_pearl(n_episodes_per_task=3, train_explorer=explorer)
-        tiny_pearl(n_episodes_per_task=3, explorer=explorer)
+        tiny_pearl(n_episodes_per_task=3, train_explorer=explorer).learn(240)
+        tiny_pearl(n_episodes_per_task=3, train_explorer=explorer)  # as what is loaded to adapt
+        tiny_pearl(n_episodes_per_task=3, explorer=explorer).learn(240)
     texts = [str(warning.message) for warning in caught if "none will act by what was inferred" in str(warning.message)]
     assert len(texts) == warns and all("{'name': 'learned-prior', 'n_exploration_episodes': 1}" in text for text in texts)
+
+
+@pytest.mark.parametrize(("radius", "warns"), [(1e-4, True), (0.6, False)])
+def test_a_training_that_reached_no_training_task_says_so(tiny_pearl: MakePEARL, radius: float, warns: bool) -> None:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        tiny_pearl(make_task_vec_env(ENV_ID, 4, env_kwargs={"goal_radius": radius})).learn(2 * ROLLOUT)
+    assert any("so they were not learnt: train longer than" in str(warning.message) for warning in caught) == warns
 
 
 def test_a_scalar_that_is_no_index_is_no_task(tiny_pearl: MakePEARL) -> None:
