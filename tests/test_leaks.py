@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch as th
 
+import htr_envs  # noqa: F401 registers the envs, in a process of its own too
 from helpers import ENV_ID, TINY, MakePEARL
 from helpers.runs import train_arguments
 from sb3_htr import PEARL

@@ -79,7 +79,7 @@ def test_the_posterior_is_that_of_the_rewards(tiny_pearl: MakePEARL) -> None:
         ({"replay_buffer_kwargs": {"relabel_probability": 0, "rl_reward_type": "dense"}}, "task_family has no compute_reward"),
         ({"explorer": "belief"}, "The explorer 'belief' goes by successes, .*: pass explorer='prior'"),
         ({"explorer": "learned-prior"}, "The explorer 'learned-prior' goes by successes"),
-        ({"train_explorer": "aggregate"}, "The explorer 'aggregate' goes by successes.* and train_explorer='prior'"),
+        ({"train_explorer": "aggregate"}, "The explorer 'aggregate' goes by successes.* train_explorer='prior'"),
     ],
 )
 def test_what_needs_successes_is_refused(tiny_pearl: MakePEARL, changed: dict[str, Any], message: str) -> None:

@@ -42,8 +42,8 @@ def check_reward_hook(
     solved = successes[:, 0]
     check_rewards_told(given, computed, task)
     _check_whole_episodes(family, columns, episodes[:MAX_WHOLE], computed, solved)
-    _check_every_success(family, columns, episodes[:MAX_WHOLE])
     _check_worth(family, columns, np.stack([episode[-1] for _, episode in episodes]))
+    _check_every_success(family, columns, episodes[:MAX_WHOLE])
     # What is more than rounding is a success to all that learns from it
     beside = np.maximum(*(np.abs(reward - traj.task_free_reward[:, 0]) for reward in (given, computed)))
     worthless = ~solved & (beside > ROUNDING)

@@ -265,8 +265,8 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
     def _check_explorer(explorer: Explorer, tells_success: bool) -> None:
         if explorer.needs_success and not tells_success:
             raise ValueError(
-                f"The explorer {explorer.name!r} goes by successes, of which the env's task_family tells nothing: choose "
-                "'prior' (in a training as explorer and train_explorer, on the command line by --method pearl-sparse-prior)."
+                f"The explorer {explorer.name!r} goes by successes, of which the env's task_family tells nothing: pass "
+                "explorer='prior' (and in a training train_explorer='prior', on the command line --method pearl-sparse-prior)."
             )
 
     @staticmethod
