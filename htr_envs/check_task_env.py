@@ -19,6 +19,8 @@ MAX_STEPS = 200  # of an episode that are looked at
 N_DRAWS = 30
 # What a step that solves nothing may be worth: the difference of two float32. More is a success to all that learns from it
 ROUNDING = 1e-5
+# Share of the successes that may be worth nothing: a reward that falls to 0 at the rim of a goal rounds some of them to it
+UNPAID = 0.1
 NOT_REPEATABLE = "The same seed, task and actions gave another episode: use no other randomness than self.np_random."
 TASK_SETS = ("train_tasks", "validation_tasks", "test_tasks")
 # What tells the reward of a step under any task; a family of a MetaEnv has none of these
@@ -291,13 +293,12 @@ def _check_sparse(family: TaskFamily, traj: Trajectory, own_tasks: FloatArray) -
         f"The sparse reward of an unsuccessful step is not 0 (beside task_free_reward) but {more:.2g}, which leaks the task: "
     )
     _require(more <= ROUNDING, leak + "compute_reward is what the task pays plus traj.task_free_reward.")
-    least = float(task_rewards[family.is_success(traj, tasks)].min())
-    unpaid = (
-        f"A step that solves a task, by is_success, is worth {least:.1g} (beside task_free_reward), no more than a failure: "
-    )
-    _require(
-        least > failures.max() + ROUNDING, unpaid + "compute_reward must pay for each success, and is_success ask for it."
-    )
+    worth = task_rewards[np.arange(len(own_tasks)), np.arange(len(own_tasks))]
+    enough = bool((worth > failures.max() + ROUNDING).all())
+    _require(enough, "A step that solves its task exactly is worth no more than a failure.")
+    unpaid = float((task_rewards[family.is_success(traj, tasks)] <= failures.max() + ROUNDING).mean())
+    advice = "are worth no more than a failure: compute_reward must pay for each success, and is_success ask for what is paid."
+    _require(unpaid <= UNPAID, f"Of the steps that solve a task, by is_success, {unpaid:.0%} {advice}")
 
 
 def _check_no_leak(plain: Episode, other: Episode) -> None:

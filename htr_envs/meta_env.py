@@ -263,8 +263,8 @@ class MetaEnv(HasTaskFamily, gym.Env[FloatArray, FloatArray], ABC):
         return self._remember_observation(self._reset_state()), {"task_id": self.task_id}
 
     def _remember_observation(self, state: ArrayLike) -> FloatArray:
-        if isinstance(state, tuple) or np.shape(state) != self.observation_space.shape:
-            given = "a tuple" if isinstance(state, tuple) else f"shape {np.shape(state)}"
+        if state is None or isinstance(state, tuple) or np.shape(state) != self.observation_space.shape:
+            given = f"a {type(state).__name__}" if state is None or isinstance(state, tuple) else f"shape {np.shape(state)}"
             raise ValueError(
                 "_reset_state returns an observation; _step_state an observation, a reward and whether the episode "
                 f"terminates. Expected an observation of shape {self.observation_space.shape}, got {given}."
@@ -294,8 +294,8 @@ class MetaEnv(HasTaskFamily, gym.Env[FloatArray, FloatArray], ABC):
             raise ResetNeeded("step was called before the first reset: call env.reset() first.")
         action = checked_action(action, self.action_space)
         stepped = self._step_state(action)
-        if not isinstance(stepped, tuple) or len(stepped) != 3:
-            got = f"{len(stepped)} values" if isinstance(stepped, tuple) else f"a {type(stepped).__name__}"
+        if not isinstance(stepped, tuple | list) or len(stepped) != 3:
+            got = f"{len(stepped)} values" if isinstance(stepped, tuple | list) else f"a {type(stepped).__name__}"
             raise ValueError(
                 f"_step_state must return an observation, a reward and whether the episode terminates, got {got}."
             )

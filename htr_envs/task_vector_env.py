@@ -162,7 +162,7 @@ class TaskVectorEnv(HasTaskFamily, VectorEnv[FloatArray, FloatArray, NDArray[Any
             raise ResetNeeded("step was called before the first reset: call reset() first.")
         actions = checked_action(actions, self.action_space)
         stepped = self._step_state(actions)
-        given = tuple(map(np.shape, stepped)) if isinstance(stepped, tuple) else f"a {type(stepped).__name__}"
+        given = tuple(map(np.shape, stepped)) if isinstance(stepped, tuple | list) else f"a {type(stepped).__name__}"
         expected = (self._observations.shape, (self.num_envs,), (self.num_envs,))
         if given != expected:
             raise ValueError(

@@ -61,9 +61,10 @@ def check_evaluations(cell: Cell, trained_with: Any = None) -> None:
     for evaluation in cell.evaluations:
         try:
             _explorer(evaluation.explorer, trained_with)
-            make_task_vec_env(cell.env_id, env_kwargs={**cell.env_kwargs, **evaluation.tested_on}).close()
+            if evaluation.tested_on:  # else it is the env of the training, which says more of it
+                make_task_vec_env(cell.env_id, env_kwargs={**cell.env_kwargs, **evaluation.tested_on}).close()
         except (ValueError, TypeError) as error:
-            raise ValueError(f"{cell.label} could not be evaluated by {evaluation.name!r}: {error}") from None
+            raise ValueError(f"{cell.label} could not be evaluated by {evaluation.name!r}: {error}") from error
 
 
 def _evaluate_by(evaluation: Evaluation, cell: Cell, model: Model, trained_with: Any) -> KwArgs:

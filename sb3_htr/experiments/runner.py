@@ -11,6 +11,7 @@ import yaml
 from filelock import Timeout
 
 import htr_envs  # noqa: F401 registers the envs
+from htr_envs.goal_env import find_hidden
 from sb3_htr.adaptation.explorers import to_explorer
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.atomic import atomic_path
@@ -103,6 +104,7 @@ def run_cell(cell: Cell, runs: Path) -> bool:
 
 def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
     import_packages(cell.gym_packages)
+    find_hidden(cell.env_id)
     # As it was imported, and may be no more when the training has ended
     code = json.dumps([digest_of_code(("sb3_htr", "htr_envs", *cell.gym_packages)), versions()])
     trained = find_finished(cell, folder)

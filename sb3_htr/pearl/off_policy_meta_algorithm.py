@@ -364,7 +364,9 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
     def _warn_without_successes(self) -> None:
         assert self.replay_buffer is not None and self.task_bank is not None
         is_over = self._n_updates > 0 and self.num_timesteps >= self._total_timesteps
-        if is_over and self.replay_buffer.tells_rewards and self.task_bank.n_train_solved == 0:
+        bank = self.task_bank
+        sees_all = self.replay_buffer.tells_rewards and bank.n_train == len(bank.task_family.train_tasks)
+        if is_over and sees_all and bank.n_train_solved == 0:
             warnings.warn(
                 "No episode of this training would have solved one of the training tasks, so they were not learnt: train "
                 f"longer than {self.num_timesteps} env steps, or see what is_success asks for.",

@@ -14,6 +14,7 @@ from typing import TextIO
 import gymnasium
 import torch as th
 
+import htr_envs
 import sb3_htr
 from sb3_htr.common.versions import versions
 
@@ -117,11 +118,20 @@ def _is_closed(stream: TextIO) -> bool:
 
 
 def _where(error: Exception) -> str:
-    """The last place on the way to an error that is in no installed package: a bug in an env may show up after hours."""
-    installed = sysconfig.get_path("purelib"), sysconfig.get_path("stdlib"), str(Path(sb3_htr.__file__).parent)
-    frames = traceback.extract_tb(error.__traceback__)
-    own = [frame for frame in frames if frame.filename.endswith(".py") and not frame.filename.startswith(installed)]
+    """Where a user's own code failed: a bug in an env may show up after hours. Nothing for an error of ours."""
+    while isinstance(error.__cause__, Exception):
+        error = error.__cause__
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename.endswith(".py")]
+    if isinstance(error, MISTAKES):
+        frames = frames[-1:]
+    own = [frame for frame in frames if _is_own(Path(frame.filename))]
     return "".join(f" ({frame.filename}, line {frame.lineno}, in {frame.name})" for frame in own[-1:])
+
+
+def _is_own(file: Path) -> bool:
+    ours = [Path(package.__file__ or "").parent for package in (sb3_htr, htr_envs)]
+    installed = {"site-packages", "dist-packages"} & {*file.parts}
+    return not installed and not any(map(file.is_relative_to, [*ours, Path(sysconfig.get_path("stdlib"))]))
 
 
 def console() -> int:
@@ -141,8 +151,11 @@ def console() -> int:
             return 1
         if os.environ.get("SB3_HTR_TRACEBACK"):
             raise
-        said = str(error) if isinstance(error, MISTAKES) else f"{type(error).__name__}: {error}{_where(error)}"
-        print(f"sb3-htr: {said}\n(SB3_HTR_TRACEBACK=1 in the environment shows where this comes from)", file=sys.stderr)
+        name = "" if isinstance(error, MISTAKES) else f"{type(error).__name__}: "
+        print(
+            f"sb3-htr: {name}{error}{_where(error)}\n(SB3_HTR_TRACEBACK=1 in the environment shows where this comes from)",
+            file=sys.stderr,
+        )
         return 1
     finally:
         _nobody_reads()

@@ -386,7 +386,7 @@ class InexactReward(LineFamily):
         return super().compute_reward(traj, task, *args) + np.float32(5e-5)
 
 
-@breaks("no more than a failure: compute_reward must pay for each success")
+@breaks("are worth no more than a failure: compute_reward must pay for each success")
 class UnpaidSuccess(LineFamily):
     """Exact ones are paid, and those beside are not."""
 
@@ -396,7 +396,7 @@ class UnpaidSuccess(LineFamily):
         return rewards if reward_type == "dense" else np.where(exact, rewards, traj.task_free_reward)
 
 
-@breaks("no more than a failure: compute_reward must pay for each success")
+@breaks("A step that solves its task exactly is worth no more than a failure")
 class WorthlessSuccess(LineFamily):
     def compute_reward(self, traj: Any, task: Any, reward_type: str = "sparse") -> Any:
         worth = self.is_success(traj, task) if reward_type == "sparse" else np.float32(0.0)

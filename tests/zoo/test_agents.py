@@ -26,7 +26,7 @@ from sb3_htr.zoo import cli
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run import model_card
 from sb3_htr.zoo.run.agents import agent_at, agent_for
-from sb3_htr.zoo.run.record import RECORD
+from sb3_htr.zoo.run.record import RECORD, command_to_go_on
 from sb3_htr.zoo.run.shipped import shipped
 from sb3_htr.zoo.run.train_arguments import training_facts
 
@@ -266,10 +266,16 @@ def test_the_command_of_a_record_is_that_of_any_machine(defaults: list[str]) -> 
 
 def test_joined_arguments_keep_folders_to_themselves() -> None:
     """rl_zoo3 takes an option and its value in one word, too."""
-    arguments = [f"--env={ENV_ID}", "-f/home/me/runs", "-tb/home/me/tb", "-i/home/me/agent.zip", "--conf-file=/home/me/my.yml"]
+    arguments = [f"--env={ENV_ID}", "-f/home/me/runs", "-tb=/home/me/tb", "-i/home/me/agent.zip", "-conf=/home/me/my.yml"]
     command = model_card.training_command({"arguments": [*arguments, "--seed=3"], "seed": 4, "method": "htr-ec"})
     assert command == f"sb3-htr train --env {ENV_ID} -i agent.zip --method htr-ec --seed 4"
     assert training_facts({}, arguments) == training_facts({}, ["-i", "/home/me/agent.zip"])
+
+
+def test_a_command_to_go_on_names_what_it_needs() -> None:
+    record = {"gym_packages": ["mine", "htr_envs"]}
+    command = command_to_go_on(Path("runs/a b"), record, trust=True)
+    assert command == "sb3-htr train --resume 'runs/a b' --gym-packages mine --trust"
 
 
 def test_a_record_may_end_with_an_option() -> None:
@@ -364,10 +370,17 @@ def test_the_console_answers_mistakes_in_one_sentence(
 BUGGY = """
 import gymnasium
 import htr_envs
+import numpy as np
 
 class Buggy(htr_envs.PointRobotEnv):
+    def __init__(self, bug=0):
+        super().__init__()
+        self.bug = bug
+
     def _step_state(self, action):
-        return self.sped
+        if self.bug == 2:
+            raise OSError("No robot")
+        return self.sped if self.bug else np.zeros(3) + np.zeros(2)
 
 gymnasium.register("Buggy-v0", Buggy, max_episode_steps=20)
 """
@@ -379,9 +392,15 @@ def test_the_console_says_where_an_env_is_broken(
     """It may show up after hours, and a second run for a traceback would take as long."""
     (tmp_path / "buggy.py").write_text(BUGGY)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["sb3-htr", "train", "--env", "Buggy-v0", "--gym-packages", "buggy"])
-    assert cli.console() == 1
-    assert re.search(r"AttributeError: .*'sped' \(.*buggy\.py, line 7, in _step_state\)\n", capsys.readouterr().err)
+    for bug, message in (
+        (0, r"could not be broadcast .* \(.*buggy\.py, line 14, in _step_state\)\n"),
+        (1, r"AttributeError: .*'sped' \(.*buggy\.py, line 14, in _step_state\)\n"),
+        (2, r": No robot \(.*buggy\.py, line 13, in _step_state\)\n"),
+    ):
+        given = ["--env", "Buggy-v0", "--gym-packages", "buggy", "--env-kwargs", f"bug:{bug}"]
+        monkeypatch.setattr(sys, "argv", ["sb3-htr", "train", *given])
+        assert cli.console() == 1
+        assert re.search(message, capsys.readouterr().err)
 
 
 @pytest.mark.parametrize("command", cli.COMMANDS)

@@ -267,6 +267,8 @@ def test_help_and_mistakes(capsys: pytest.CaptureFixture[str], tmp_path: Path) -
     with pytest.raises(SystemExit):
         main(["train", "--env", ENV_ID, "--see", "9"])
     assert "unrecognized arguments: --see 9" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="There is no option -par: those with one dash are"):
+        main(["train", "--env", ENV_ID, "-par", "gamma:0.9"])
     with pytest.raises(ValueError, match="--algo is 'sac', but sb3-htr trains pearl"):
         main(["train", "--env", ENV_ID, "--algo", "sac"])
     with pytest.raises(FileNotFoundError, match="There is no run in"):

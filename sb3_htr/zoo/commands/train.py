@@ -17,7 +17,7 @@ from sb3_htr.zoo.run.manager import run_rl_zoo
 from sb3_htr.zoo.run.method import DEFAULT, get_method, methods
 from sb3_htr.zoo.run.record import OF_TRAINING, RECORD, command_to_go_on, read_record
 from sb3_htr.zoo.run.study import absolute
-from sb3_htr.zoo.run.train_arguments import default_arguments, given_arguments, spelled_out, value_of
+from sb3_htr.zoo.run.train_arguments import check_options, default_arguments, given_arguments, spelled_out, value_of
 from sb3_htr.zoo.run.trust import CONF, WEIGHTS, check_arguments, import_packages, see_working_folder
 
 OWN_ENV = "An env of your own is found once its module is imported, by --gym-packages MODULE."
@@ -36,8 +36,9 @@ defaults here: -conf, the YAML file in hyperparams/ of the method's algorithm; -
 beside rl_zoo3's:
   --method NAME  htr-ser (default), htr-ec, pearl-dense, pearl-sparse; rivals: htr-hfr, htr-hipi, rl2, sac-her. Those of PEARL
                  with -prior behind it under PEARL's own protocol
-  --resume RUN   go on with a run from its latest checkpoint, exactly; takes no other arguments but those below
-                 and -n STEPS: so many more than planned; a learning rate that decays does so anew over what is then planned
+  --resume RUN   go on with a run from its latest checkpoint, exactly; takes no other arguments but --trust, the
+                 --gym-packages of an env of your own, and -n STEPS: so many more than planned; a learning rate that decays
+                 does so anew over what is then planned
   --trust        let files (YAML, the record of a run) import and evaluate what they name
 no effect here: --n-eval-envs
 """
@@ -103,7 +104,9 @@ def main(argv: Sequence[str]) -> None:
             raise ValueError("--env is missing: give the id of a task env, as in `sb3-htr train --env SparsePointRobot-v0`.")
         see_working_folder()  # for what -params and -conf name
         packages = ["--gym-packages", *args.gym_packages] if args.gym_packages else []
-        given = [*env, *_from_anywhere(spelled_out(rest)), *packages]
+        rest = spelled_out(rest)
+        check_options(rest)
+        given = [*env, *_from_anywhere(rest), *packages]
         try:
             find_hidden(args.env or "")
         except gym.error.UnregisteredEnv as error:

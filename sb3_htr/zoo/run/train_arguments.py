@@ -9,8 +9,8 @@ from sb3_htr.zoo.run.trust import WEIGHTS
 
 # PEARL's reference adapts for as many episodes. One thread: two runs on two cores must not fight for them
 ALWAYS = {"--num-threads": "1", "--save-freq": "20000", "--eval-episodes": "20"}
-# Those of rl_zoo3 with one dash and one value, which may be in the same word
-SHORT = ("-n", "-f", "-i", "-tb")
+# Those of rl_zoo3 with one dash: with a value that may be in the same word, with values behind them or an "=", and with none
+JOINED, APART, FLAGS = ("-n", "-f", "-i", "-tb"), ("-conf", "-params", "-tags"), ("-P", "-uuid", "-optimize", "-h")
 
 
 def default_arguments(algorithm: Algorithm) -> list[str]:
@@ -30,15 +30,28 @@ def spelled_out(arguments: Sequence[str]) -> list[str]:
 
     def parts(word: str) -> Iterator[str]:
         option, equals, value = word.partition("=")
-        short = next((short for short in SHORT if word.startswith(short) and word != short), None)
-        if equals and option.startswith("--"):
+        joined = next((name for name in JOINED if word.startswith(name) and word != name), None)
+        if equals and (option.startswith("--") or option in (*JOINED, *APART)):
             yield from (option, value)
-        elif short is not None:
-            yield from (short, word.removeprefix(short))
+        elif joined is not None:
+            yield from (joined, word.removeprefix(joined))
         else:
             yield word
 
     return [part for word in arguments for part in parts(word)]
+
+
+def check_options(arguments: Sequence[str]) -> None:
+    """
+    Those with one dash; rl_zoo3's parser looks at the others.
+
+    :param arguments: :func:`spelled_out`
+    :raises ValueError: for one that there is not, such as an abbreviation
+    """
+    known = (*JOINED, *APART, *FLAGS)
+    for word in arguments:
+        if word[:1] == "-" and word[1:2].isalpha() and word not in known:
+            raise ValueError(f"There is no option {word}: those with one dash are {', '.join(known)}.")
 
 
 def value_of(arguments: Sequence[str], *options: str) -> str | None:
