@@ -1,5 +1,6 @@
 """Envs and settings that cannot work are refused in one sentence, before any work is lost."""
 
+import contextlib
 import copy
 import warnings
 from collections.abc import Callable
@@ -854,17 +855,23 @@ def test_a_hindsight_task_that_its_step_does_not_solve_is_named(
         tiny_pearl(env).learn(ROLLOUT)
 
 
-def test_a_success_that_pays_nothing_is_named(tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Exact hindsight tasks do pay, and own tasks are seldom solved."""
-    near = PointRobotFamily(goal_radius=0.02)
-    reward = PointRobotFamily.compute_reward
-    monkeypatch.setattr(
-        PointRobotFamily, "compute_reward", lambda self, traj, task, kind="sparse": reward(near, traj, task, kind)
-    )
-    with pytest.raises(
-        ValueError, match=r"\d+ of \d+ steps that solve a task which was reached, by is_success, are worth nothing"
-    ):
-        tiny_pearl().learn(ROLLOUT)
+@pytest.mark.parametrize(("radius", "is_refused"), [(0.02, True), (0.195, False)])
+def test_successes_that_pay_nothing_are_named(
+    radius: float, is_refused: bool, tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """
+    Exact hindsight tasks do pay, and own tasks are seldom solved. But where rewards fall to 0 at the rim of a goal, some
+    successes are worth nothing.
+    """
+    near, compute_reward = PointRobotFamily(goal_radius=radius), PointRobotFamily.compute_reward
+
+    def pays_near(self: Any, traj: Any, task: Any, reward_type: str = "sparse") -> Any:
+        return compute_reward(near, traj, task, reward_type)
+
+    monkeypatch.setattr(PointRobotFamily, "compute_reward", pays_near)
+    refused = pytest.raises(ValueError, match=r"\d+ of \d+ steps that solve a task which was reached, by is_success, are")
+    with refused if is_refused else contextlib.nullcontext():
+        tiny_pearl().learn(4 * ROLLOUT)
 
 
 def test_a_task_that_is_none_costs_no_reset(tiny_pearl: MakePEARL) -> None:

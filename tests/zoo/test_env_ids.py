@@ -2,12 +2,16 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium as gym
 import pytest
 
+from sb3_htr.experiments.grid import Experiment, Variant, by
+from sb3_htr.experiments.runner import run_cell
 from sb3_htr.zoo.cli import main
+from sb3_htr.zoo.commands import train
 from sb3_htr.zoo.run.agents import agent_at, agent_for
 from sb3_htr.zoo.run.record import RECORD
 
@@ -75,6 +79,24 @@ def test_the_goal_env_of_a_user_is_trained_on_by_its_id(
     assert main(["train", "--resume", str(run), *packages, "-n", "48"]) == 0
     assert main(["evaluate", str(run), *packages, "--n-episodes", "2"]) == 0
     assert "HiddenGoal/StepOfTheTest-v0" in capsys.readouterr().out
+
+
+def test_the_goal_env_of_a_user_has_experiments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cell is run where nobody has made the id."""
+    (tmp_path / "goals_of_the_test.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "goals_of_the_test", raising=False)
+    for env_id in ("HiddenGoal/StepOfTheTest-v0", "StepOfTheTest-v0"):
+        monkeypatch.delitem(gym.registry, env_id, raising=False)
+    env_id, evaluations = "HiddenGoal/StepOfTheTest-v0", by(("belief",), {"disable_env_checker": True})
+    (cell,) = Experiment("one", "", env_id, 96, (Variant("htr-ser"),), 1, evaluations=evaluations).cells()
+
+    def trained(arguments: list[str]) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(train, "main", trained)
+    with pytest.raises(KeyboardInterrupt):
+        run_cell(replace(cell, gym_packages=("goals_of_the_test",)), tmp_path)
 
 
 def test_a_goal_env_that_is_not_there_is_named() -> None:
