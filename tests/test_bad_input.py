@@ -420,6 +420,9 @@ def test_a_settings_file_that_is_none(tmp_path: Path, monkeypatch: pytest.Monkey
         sentence = f"^{named} is no file of hyperparameters: expected ids of envs, with settings, in a dict named hyperparams"
         with pytest.raises(ValueError, match=sentence):
             main(["train", "--env", ENV_ID, "-conf", file])
+    (tmp_path / "other.yml").write_text("Other-v0:\n  n_timesteps: 100\n")
+    with pytest.raises(ValueError, match=rf"other\.yml has no block {ENV_ID}, and none named default"):
+        main(["train", "--env", ENV_ID, "-conf", "other.yml"])
     with pytest.raises(FileNotFoundError, match=r"There is no file nothing\.py: expected a file of yours"):
         main(["train", "--env", ENV_ID, "-conf", "nothing.py"])
 

@@ -110,6 +110,12 @@ class MetaExperimentManager(ExperimentManager):
                 raise ValueError(
                     f"{self.config} is no file of hyperparameters: expected ids of envs, with settings{named}."
                 ) from None
+            except ValueError as error:
+                if not str(error).startswith("Hyperparameters not found"):
+                    raise
+                raise ValueError(
+                    f"{self.config} has no block {self.env_name.gym_id}, and none named default: add one with its settings."
+                ) from None
             except yaml.YAMLError as error:
                 raise ValueError(f"{self.config} cannot be read: {' '.join(str(error).split())}.") from None
         in_file = hyperparams.pop("method", DEFAULT)
