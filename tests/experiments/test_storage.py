@@ -38,6 +38,7 @@ from sb3_htr.experiments.runner import find_finished, run_cell
 from sb3_htr.experiments.storage import claim as claim_module
 from sb3_htr.experiments.storage import objects, storage_at
 from sb3_htr.experiments.storage.claim import Claim, Watch
+from sb3_htr.experiments.storage.node_folder import node_folder
 from sb3_htr.experiments.storage.objects import ObjectStore
 from sb3_htr.experiments.storage.working_copy import WorkingCopy
 from sb3_htr.zoo.cli import main
@@ -323,6 +324,19 @@ def test_one_that_was_taken_for_dead_sends_nothing(url: str, trains: Any) -> Non
     assert not list(Path(store.root).rglob("late.txt"))
     store.look([cell])
     assert not store.is_finished(cell) and store.is_claimed(cell)
+
+
+def test_what_killed_processes_left_is_removed_and_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with node_folder() as at_work, node_folder() as other:
+        code = "import os; from sb3_htr.experiments.storage.node_folder import node_folder\n"
+        killed = [sys.executable, "-c", f"{code}with node_folder() as folder: print(folder, flush=True); os._exit(9)"]
+        environment = {**os.environ, "TMPDIR": str(tmp_path)}
+        left = Path(subprocess.run(killed, env=environment, capture_output=True, text=True).stdout.strip())
+        assert left.is_dir() and left.parent == tmp_path
+        with node_folder() as next_one:
+            assert {*tmp_path.glob("sb3-htr-copy-*")} == {at_work, other, next_one}
+    assert not [*tmp_path.glob("sb3-htr-copy-*")]
 
 
 def test_a_killed_node_costs_what_it_had_not_sent(tmp_path: Path, url: str) -> None:

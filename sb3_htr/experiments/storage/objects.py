@@ -19,6 +19,7 @@ from sb3_htr.common.errors import last_line
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.runner import run_cell
 from sb3_htr.experiments.storage.claim import RENEW, Claim, Objects, Watch, claims_among
+from sb3_htr.experiments.storage.node_folder import node_folder
 from sb3_htr.experiments.storage.working_copy import WorkingCopy
 
 T = TypeVar("T")
@@ -186,8 +187,7 @@ def run_on_copy(cell: Cell, url: str, void: bytes | None = None) -> bool:
     try:
         if not _patiently(lambda: claim.take(void)):
             return False
-        with _Every(RENEW, claim.renew), TemporaryDirectory(prefix="sb3-htr-") as folder:
-            runs = Path(folder)
+        with _Every(RENEW, claim.renew), node_folder() as runs:
             copy = WorkingCopy(files, there, cell.run_folder(runs), claim.is_ours)
             _patiently(copy.fetch)
             if _patiently(lambda: files.exists(result)):
