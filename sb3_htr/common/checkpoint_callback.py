@@ -16,12 +16,7 @@ from stable_baselines3.common.logger import TensorBoardOutputFormat
 
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.callback import parts_of
-from sb3_htr.common.checkpoint import (
-    CHECKPOINTS,
-    checkpoints,
-    n_steps_at,
-    write_checkpoint,
-)
+from sb3_htr.common.checkpoint import CHECKPOINTS, checkpoints, n_steps_at, write_checkpoint
 from sb3_htr.common.errors import WRITE_ERRORS, reason
 from sb3_htr.common.settings import check_numbers
 

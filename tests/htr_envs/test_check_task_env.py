@@ -123,7 +123,13 @@ class NoisyBatch(DynamicsVectorEnv):
         return super().step(actions)
 
 
+class NowhereAtFirst(PointRobotVectorEnv):
+    def _reset_state(self, indices: Any) -> Any:
+        return super()._reset_state(indices) * np.nan
+
+
 BATCHES: dict[str, tuple[Any, str]] = {
+    "nowhere at first": (NowhereAtFirst, "The batch of the id begins with an observation that is not finite"),
     "of its own": (PointRobotVectorEnv, ""),
     "backwards": (
         lambda num_envs, max_episode_steps: DynamicsVectorEnv(PointRobotFamily(), Backwards(num_envs), max_episode_steps),

@@ -32,5 +32,5 @@ def node_folder() -> Iterator[Path]:
     try:
         yield folder
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
         owner.release()
+        shutil.rmtree(folder, ignore_errors=True)
