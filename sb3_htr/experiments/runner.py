@@ -22,8 +22,6 @@ from sb3_htr.experiments.evaluation_cache import FOLDER, Kept, digest_of_code
 from sb3_htr.experiments.log import logged
 from sb3_htr.experiments.protocol import check_evaluations, evaluate
 from sb3_htr.pearl.untrusted import EXPLORERS, check_is_ours
-from sb3_htr.rivals.base import Rival
-from sb3_htr.rivals.untrusted import plain_policy
 from sb3_htr.zoo.commands import train
 from sb3_htr.zoo.run.agents import agent_at, file_stem, find_runs, is_finished, n_steps_of
 from sb3_htr.zoo.run.algorithm import Model
@@ -187,13 +185,10 @@ def _planned(cell: Cell) -> dict[str, Any]:
 
 def _check_loadable(cell: Cell) -> None:
     """Before it is trained: its model will be loaded as those of strangers are."""
-    model_class, settings = get_method(cell.method).algorithm.model_class(), hyperparams_of(cell)
-    advice = "Leave it out."
+    settings = hyperparams_of(cell)
     try:
-        if issubclass(model_class, Rival):
-            advice = f"Leave it out, or name it in POLICY_SIZES of {model_class.__name__}."
-            plain_policy(model_class, settings)
+        get_method(cell.method).algorithm.check_loadable(settings)
         for name in [name for name in EXPLORERS if name in settings]:
             check_is_ours(name, type(to_explorer(settings[name])).__module__)
     except ValueError as error:
-        raise ValueError(f"{cell.label} could not be evaluated: {error.args[0].rstrip('.')}. {advice}") from None
+        raise ValueError(f"{cell.label} could not be evaluated: {error.args[0].rstrip('.')}. Leave it out.") from None

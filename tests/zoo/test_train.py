@@ -111,7 +111,7 @@ def test_env_kwargs_of_the_yaml_reach_the_evaluation(tmp_path: Path, capsys: pyt
     file.write_text(yaml.safe_dump({ENV_ID: {**block, "env_kwargs": {"goal_distance": 0.05}}}))
     arguments = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(file), "--eval-freq", "240", "--verbose", "0"]
     assert main(arguments) == 0
-    assert "240 env steps, that of `learn()` for episodes of 20 steps 150,000: -n 150000 takes it" in capsys.readouterr().out
+    assert "240 env steps, that of `learn()` for such episodes 150,000: -n 150000 takes it" in capsys.readouterr().out
     assert main([*arguments, "-n", "240"]) == 0
     assert "`learn()`" not in capsys.readouterr().out, "nobody asked"
     # Every goal disc of this distance holds the start, so that all adaptations find it at once

@@ -15,7 +15,6 @@ from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.settings import keywords_of
 from sb3_htr.common.vec_env import N_ENVS
-from sb3_htr.rivals.base import Rival
 from sb3_htr.zoo.commands.arguments import add_agent_arguments, make_parser, parse
 from sb3_htr.zoo.run.agents import TrainedAgent
 from sb3_htr.zoo.run.hub import CARD, FILM, files, model_name, push
@@ -54,9 +53,7 @@ def export(agent: TrainedAgent, path: Path) -> dict[str, Any]:
         model.critic.half()
         for target, parameter in zip(model.critic_target.parameters(), model.critic.parameters(), strict=True):
             target.data = parameter.data
-    kept = {*keywords_of(type(model)), *ALSO_KEPT} - {"tensorboard_log"}
-    if isinstance(model, Rival):
-        kept = kept - {*model.ACTS_WITH} | {*model.KEPT_TO_ACT}
+    kept = agent.algorithm.kept_to_act({*keywords_of(type(model)), *ALSO_KEPT} - {"tensorboard_log"})
     record = {key: agent.record[key] for key in KEPT_OF_RECORD if key in agent.record}
     which = "best on the validation tasks" if agent.path.stem == "best_model" else "last"
     record["command"] = training_command(agent.record)

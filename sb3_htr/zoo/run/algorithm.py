@@ -8,15 +8,23 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.pearl import PEARL, load_untrusted
+from sb3_htr.pearl.horizon import timesteps_for
+from sb3_htr.pearl.policies import PEARLPolicy
 from sb3_htr.rivals.base import Rival
 from sb3_htr.rivals.off_policy import OffPolicyRival
 from sb3_htr.rivals.on_policy import OnPolicyRival
 from sb3_htr.rivals.untrusted import load_untrusted as load_untrusted_rival
+from sb3_htr.rivals.untrusted import plain_policy
 from sb3_htr.zoo.run import search_space
 from sb3_htr.zoo.run.search_space import SearchSpace
 from sb3_htr.zoo.run.shipped import hyperparams_file
+from sb3_htr.zoo.run.trust import refuse
 
 # What a run trains and a command adapts
 Model = PEARL | Rival
@@ -25,6 +33,8 @@ Model = PEARL | Rival
 @dataclass(frozen=True)
 class Algorithm:
     """
+    A rival's.
+
     :param name: rl_zoo3's ``--algo``
     :param module: that its class is in, imported when it is needed
     :param class_name: of the class
@@ -65,18 +75,78 @@ class Algorithm:
         :return: a model to adapt and evaluate with
         :raises ValueError: if it is no such file
         """
+        return self.model_class().load(path, device=device) if trust else self._load_untrusted(path, record, env, device)
+
+    def _load_untrusted(self, path: Path, record: dict[str, Any], env: gym.Env, device: str) -> Model:
+        return load_untrusted_rival(self.model_class(), path, record.get("hyperparams", {}), env, device)
+
+    def check_loadable(self, hyperparams: dict[str, Any]) -> None:
+        """
+        :param hyperparams: of a training to come
+        :raises ValueError: if its model could be loaded by ``trust`` alone
+        """
+        plain_policy(self.model_class(), hyperparams)
+
+    def load_to_train(self, path: str, env: VecEnv, device: th.device | str, **kwargs: Any) -> Any:
+        """
+        :param path: model file of unknown origin
+        :param env: to train in
+        :param device: torch device
+        :param kwargs: arguments of the class, in place of those of the file
+        :return: a model to train on
+        :raises ValueError: if only ``trust`` loads such
+        """
+        raise refuse(path, "is unpickled to be trained on")
+
+    def kept_to_act(self, names: set[str]) -> set[str]:
+        """
+        :param names: of arguments and attributes
+        :return: what of them an agent that acts and trains no more has, and what it has beside
+        """
         model_class = self.model_class()
-        if trust:
-            return model_class.load(path, device=device)
-        if model_class is PEARL:
-            return load_untrusted(path, env, device)
-        return load_untrusted_rival(model_class, path, record.get("hyperparams", {}), env, device)
+        return names - {*model_class.ACTS_WITH} | {*model_class.KEPT_TO_ACT}
+
+    def owners(self) -> dict[str, Any]:
+        """
+        :return: of settings that are within another one, whose arguments they are, by the name of that one
+        """
+        return {}
+
+    def usual_timesteps(self, model: BaseAlgorithm) -> int:
+        """
+        :param model: as set up
+        :return: env steps that ``learn`` would take by default, 0 without a rule
+        """
+        return 0
+
+
+class PEARLAlgorithm(Algorithm):
+    """PEARL's, whose files can be read and trained on without running code of theirs."""
+
+    def _load_untrusted(self, path: Path, record: dict[str, Any], env: gym.Env, device: str) -> Model:
+        return load_untrusted(path, env, device)
+
+    def check_loadable(self, hyperparams: dict[str, Any]) -> None:
+        pass
+
+    def load_to_train(self, path: str, env: VecEnv, device: th.device | str, **kwargs: Any) -> PEARL:
+        return load_untrusted(path, env, device, **kwargs)
+
+    def kept_to_act(self, names: set[str]) -> set[str]:
+        return names
+
+    def owners(self) -> dict[str, Any]:
+        return {"replay_buffer_kwargs": MultiTaskReplayBuffer, "policy_kwargs": PEARLPolicy}
+
+    def usual_timesteps(self, model: BaseAlgorithm) -> int:
+        n_steps: int | None = getattr(model, "max_episode_steps", None)
+        return 0 if n_steps is None else timesteps_for(n_steps)
 
 
 ALGORITHMS = {
     algorithm.name: algorithm
     for algorithm in (
-        Algorithm(
+        PEARLAlgorithm(
             "pearl",
             "sb3_htr.pearl",
             "PEARL",

@@ -40,12 +40,7 @@ from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.settings import check_keywords, check_numbers, keywords_of
 from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
 from sb3_htr.common.versions import hardware, made_by
-from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.pearl.divergence import DivergedError
-from sb3_htr.pearl.horizon import timesteps_for
-from sb3_htr.pearl.pearl import PEARL
-from sb3_htr.pearl.policies import PEARLPolicy
-from sb3_htr.pearl.untrusted import load_untrusted
 from sb3_htr.zoo.run.algorithm import Algorithm
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback, ProgressCallback
 from sb3_htr.zoo.run.folder import SystemLock, claim, lock
@@ -54,7 +49,7 @@ from sb3_htr.zoo.run.record import RECORD, command_to_go_on, read_record, record
 from sb3_htr.zoo.run.shipped import find_hyperparams
 from sb3_htr.zoo.run.study import check_is_there, opened
 from sb3_htr.zoo.run.train_arguments import given_arguments
-from sb3_htr.zoo.run.trust import check_arguments, plain_settings, refuse
+from sb3_htr.zoo.run.trust import check_arguments, plain_settings
 from sb3_htr.zoo.run.yaml_checks import checked_kinds
 
 # What a YAML file may have beside the arguments of the algorithm
@@ -209,8 +204,7 @@ class MetaExperimentManager(ExperimentManager):
             raise ValueError(f"{elsewhere[0]} is no hyperparameter: give it by {OPTIONS[elsewhere[0]]}.")
         model_class = self.method.algorithm.model_class()
         own = {*keywords_of(model_class), *ZOO_SETTINGS}
-        within = {"replay_buffer_kwargs": MultiTaskReplayBuffer, "policy_kwargs": PEARLPolicy} if model_class is PEARL else {}
-        for name, owner in within.items():
+        for name, owner in self.method.algorithm.owners().items():
             if misplaced := sorted(hyperparams.keys() & keywords_of(owner) - own):
                 raise ValueError(f"{misplaced[0]} is a setting within {name}: -params \"{name}:{{'{misplaced[0]}':...}}\".")
         check_keywords(model_class.__name__, hyperparams, model_class, also=ZOO_SETTINGS)
@@ -302,14 +296,13 @@ class MetaExperimentManager(ExperimentManager):
         :param model: as set up
         """
         done = 0
-        if isinstance(model, PEARL) and model.max_episode_steps is not None and self.args.n_timesteps == -1:
+        usual = self.method.algorithm.usual_timesteps(model)
+        if self.args.n_timesteps == -1 and self.n_timesteps < usual:
             # The block `default` has the budget of short episodes
-            usual = timesteps_for(model.max_episode_steps)
-            if self.n_timesteps < usual:
-                print(
-                    f"The budget of {self.config} is {self.n_timesteps:,} env steps, that of `learn()` for episodes of "
-                    f"{model.max_episode_steps} steps {usual:,}: -n {usual} takes it."
-                )
+            print(
+                f"The budget of {self.config} is {self.n_timesteps:,} env steps, that of `learn()` for such episodes "
+                f"{usual:,}: -n {usual} takes it."
+            )
         if self.resumed is not None:
             assert self._checkpointing is not None, "a run that has a checkpoint makes them"
             self._checkpointing.restore(cast(Any, model), self._checkpoint)
@@ -354,12 +347,10 @@ class MetaExperimentManager(ExperimentManager):
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
         if self.trust:
             return super()._load_pretrained_agent(hyperparams, env)
-        if self.method.algorithm.model_class() is not PEARL:
-            raise refuse(self.trained_agent, "is unpickled to be trained on")
         print("Loading pretrained agent")
         given = {key: value for key, value in hyperparams.items() if key not in ("policy", "policy_kwargs")}
         logged = {"seed": self.seed, "tensorboard_log": self.tensorboard_log, "verbose": self.verbose}
-        model = load_untrusted(self.trained_agent, env, self.device, **given, **logged)
+        model = self.method.algorithm.load_to_train(self.trained_agent, env, self.device, **given, **logged)
         replay_buffer = Path(self.trained_agent).with_name("replay_buffer.pkl")
         if replay_buffer.exists():
             print("Loading replay buffer")
