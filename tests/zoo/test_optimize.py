@@ -224,6 +224,7 @@ def test_what_is_sampled_makes_a_model_of_the_method_and_is_what_is_loaded(name:
         sampled = space.sample(trial, of_others)
         assert sampled == space.convert(trial.params) and 0.8 <= sampled["gamma"] < 1
         assert ("hindsight_task_strategy" in trial.params) == (method.name.split("-prior")[0] in ("htr-ser", "htr-ec"))
+        assert ("temperature" in trial.params) == (method.name.split("-prior")[0] in ("htr-hfr", "htr-hipi"))
         assert sampled["learning_rate"] == f"lin_{trial.params['learning_rate']}"
         sampled = MetaExperimentManager._preprocess_schedules(sampled)
         model = PEARL("MlpPolicy", ENV_ID, **merged(method.hyperparams(), sampled))

@@ -12,6 +12,7 @@ from sb3_htr.common.settings import check_numbers, keywords_of
 from sb3_htr.htr.relabel import RELABELLERS, TrainingTaskRelabelling
 from sb3_htr.rivals.adaptation import OwnWay
 from sb3_htr.zoo.run.algorithm import ALGORITHMS, Algorithm, check_folder_name
+from sb3_htr.zoo.run.search_space import OF_RELABELLERS
 from sb3_htr.zoo.run.shipped import hyperparams_file
 
 DEFAULT = "htr-ser"
@@ -136,8 +137,8 @@ class PEARLMethod(Method):
 
     def not_searched(self) -> set[str]:
         if self.relabel_probability == 0:
-            return {"relabel_probability", "hindsight_task_strategy"}
-        return {"hindsight_task_strategy"} - self.relabeller_settings()
+            return {"relabel_probability", *OF_RELABELLERS}
+        return {*OF_RELABELLERS} - self.relabeller_settings()
 
     def explorer_for(self, name: str) -> str:
         return name

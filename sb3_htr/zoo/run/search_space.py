@@ -82,8 +82,17 @@ ARCHS = {"small": [64, 64], "medium": [128, 128]}
 # Episodes have some tens to hundreds of steps, which is what the discount must reach over
 OF_ALL = {"learning_rate": (1e-4, 3e-3), "one_minus_gamma": (0.005, 0.2)}
 
+# Settings of relabellers, of which each has some
+OF_RELABELLERS = ("hindsight_task_strategy", "temperature")
+
 PEARL = SearchSpace(
-    floats={**OF_ALL, "tau": (0.002, 0.05), "ent_coef": (1e-3, 1e-1), "kl_coef": (1e-4, 1e-1)},
+    floats={
+        **OF_ALL,
+        "tau": (0.002, 0.05),
+        "ent_coef": (1e-3, 1e-1),
+        "kl_coef": (1e-4, 1e-1),
+        "temperature": (1e-3, 1.0),  # of what is relabelled under training tasks
+    },
     ints={
         "n_steps": (1, 10),
         "batch_size_pow": (3, 8),
@@ -100,7 +109,7 @@ PEARL = SearchSpace(
     within={
         **dict.fromkeys(("net_arch", "encoder_arch", "latent_dim"), ("policy_kwargs",)),
         "relabel_probability": ("replay_buffer_kwargs",),
-        "hindsight_task_strategy": ("replay_buffer_kwargs", "relabeller"),
+        **dict.fromkeys(OF_RELABELLERS, ("replay_buffer_kwargs", "relabeller")),
     },
     learning_rate_falls=True,  # as PEARL's default does
 )
