@@ -13,9 +13,9 @@ from htr_envs.goal_env import NAMESPACE, find_hidden
 from sb3_htr.common.checkpoint import n_steps_done
 from sb3_htr.zoo.run.agents import find_run, is_finished, n_steps_of
 from sb3_htr.zoo.run.malloc import keep_freed_memory
-from sb3_htr.zoo.run.manager import run_rl_zoo
 from sb3_htr.zoo.run.method import DEFAULT, get_method, methods
 from sb3_htr.zoo.run.record import OF_TRAINING, RECORD, command_to_go_on, read_record
+from sb3_htr.zoo.run.rl_zoo import run_rl_zoo
 from sb3_htr.zoo.run.study import absolute
 from sb3_htr.zoo.run.train_arguments import check_options, default_arguments, given_arguments, spelled_out, value_of
 from sb3_htr.zoo.run.trust import CONF, WEIGHTS, check_arguments, import_packages, see_working_folder

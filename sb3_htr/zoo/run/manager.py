@@ -1,53 +1,45 @@
 """rl_zoo3's experiment manager, for runs of task envs."""
 
-import argparse
 import contextlib
 import importlib
 import shutil
-import signal
 import sys
-import threading
 import traceback
 import warnings
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from datetime import datetime, timezone
 from functools import partial
 from io import StringIO
 from pathlib import Path
 from pprint import pprint
-from types import ModuleType, SimpleNamespace
 from typing import Any, cast
 
 import optuna
-import rl_zoo3.train
 import yaml
-from rl_zoo3 import exp_manager
 from rl_zoo3.exp_manager import ExperimentManager
-from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
-from rl_zoo3.utils import ALGOS, SimpleLinearSchedule
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
+from rl_zoo3.utils import SimpleLinearSchedule
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import LinearSchedule, get_device
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 import htr_envs  # noqa: F401 registers the envs
-from sb3_htr.adaptation.callbacks import MetaEvalCallback
 from sb3_htr.common.checkpoint import checkpoints, load_latest
 from sb3_htr.common.checkpoint_callback import CheckpointCallback, cut_monitor_files
 from sb3_htr.common.errors import WRITE_ERRORS, reason
-from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.settings import check_keywords, check_numbers, keywords_of
 from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
 from sb3_htr.common.versions import hardware, made_by
 from sb3_htr.pearl.divergence import DivergedError
-from sb3_htr.zoo.run.algorithm import Algorithm
-from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback, ProgressCallback
+from sb3_htr.zoo.run.callbacks import ProgressCallback
 from sb3_htr.zoo.run.folder import SystemLock, claim, lock
 from sb3_htr.zoo.run.method import DEFAULT, get_method, merged, names_of
 from sb3_htr.zoo.run.record import RECORD, command_to_go_on, read_record, record_going_on, write_record
 from sb3_htr.zoo.run.shipped import find_hyperparams
-from sb3_htr.zoo.run.study import check_is_there, opened
+from sb3_htr.zoo.run.soft_interrupt import soft_interrupt
+from sb3_htr.zoo.run.study import check_is_of, check_is_there
 from sb3_htr.zoo.run.train_arguments import given_arguments
 from sb3_htr.zoo.run.trust import check_arguments, plain_settings
 from sb3_htr.zoo.run.yaml_checks import checked_kinds
@@ -150,25 +142,11 @@ class MetaExperimentManager(ExperimentManager):
         return hyperparams, saved
 
     def _check_study(self) -> None:
-        """Trials of several envs, methods or budgets have no best one, and settings of one are none of another."""
         assert self.storage is not None
-        try:
-            study = optuna.load_study(study_name=self.study_name, storage=opened(self.storage))
-        except KeyError:  # it is said elsewhere that there is none
-            return
-        facts: dict[str, Any] = {"env": str(self.env_name.gym_id), "method": self.method.name}
+        facts: dict[str, Any] = {"env": self.env_name.gym_id, "method": self.method.name}
         if self.optimize_hyperparameters:
-            given = {"env-kwargs": self.env_kwargs, "n-timesteps": self.n_timesteps, "hyperparams": self._given}
-            facts |= {name: str(value) for name, value in given.items()}
-        for name, value in facts.items():
-            # Older studies do not say
-            if (known := study.user_attrs.get(name, value)) != value:
-                raise ValueError(
-                    f"The study {study.study_name!r} is of {name} {known}, and not {value}: give --{name} as there, or search "
-                    "under another --study-name."
-                )
-            if self.optimize_hyperparameters:
-                study.set_user_attr(name, value)
+            facts |= {"env-kwargs": self.env_kwargs, "n-timesteps": self.n_timesteps, "hyperparams": self._given}
+        check_is_of(self.storage, self.study_name, facts, note=self.optimize_hyperparameters)
 
     def _trial(self, trial_id: int | None) -> dict[str, Any]:
         named = {"--storage": self.storage, "--study-name": self.study_name, "--trial-id": trial_id}
@@ -310,7 +288,7 @@ class MetaExperimentManager(ExperimentManager):
             if self._going_on is not None:  # not before: a run that is refused has the plan that it had
                 write_record(Path(self.save_path), self._going_on)
         log_interval = {-1: 1}.get(self.log_interval, self.log_interval if self.log_interval > 0 else None)
-        with contextlib.ExitStack() as on_failure, _soft_interrupt(self._checkpointing):
+        with contextlib.ExitStack() as on_failure, soft_interrupt(self._checkpointing):
             assert self._lock is not None
             on_failure.callback(self._lock.release)
             try:
@@ -442,71 +420,3 @@ class MetaExperimentManager(ExperimentManager):
 
     def _hardware(self) -> str:
         return hardware(get_device(self.device))
-
-
-@contextlib.contextmanager
-def _soft_interrupt(checkpointing: CheckpointCallback | None) -> Iterator[None]:
-    """Let the first Ctrl-C end the training before the next rollout, with a checkpoint, and the second one at once."""
-    if checkpointing is None or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def stop(signum: int, frame: Any) -> None:
-        signal.signal(signal.SIGINT, before)
-        print("Stopping after this rollout, with a checkpoint. Press Ctrl-C again to stop at once.")
-        checkpointing.stop()
-
-    before = signal.signal(signal.SIGINT, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def run_rl_zoo(
-    program: str,
-    algorithm: Algorithm,
-    arguments: list[str],
-    method: str | None = None,
-    resumed: Path | None = None,
-    trust: bool = False,
-) -> None:
-    """
-    rl_zoo3's train with one of our algorithms in it.
-
-    :param program: name for its messages
-    :param algorithm: the one that ``--algo`` names
-    :param arguments: for it
-    :param method: name of the method; that of the YAML file by default
-    :param resumed: folder of the run that goes on, None for a new one
-    :param trust: whether files may have code run
-    """
-    ALGOS[algorithm.name] = algorithm.model_class()
-    if algorithm.search_space is not None:
-        HYPERPARAMS_CONVERTER[algorithm.name] = algorithm.search_space.convert
-    manager = partial(MetaExperimentManager, method=method, resumed=resumed, trust=trust)
-    # rl_zoo3 looks these names up when it needs them
-    replaced: dict[ModuleType, dict[str, Any]] = {
-        exp_manager: {
-            "EvalCallback": MetaEvalCallback,
-            "TrialEvalCallback": MetaTrialEvalCallback,
-            "CheckpointCallback": CheckpointCallback,
-            "ProgressBarCallback": MetaProgressBarCallback,
-        },
-        rl_zoo3.train: {
-            "ExperimentManager": manager,
-            "ALGOS": {algorithm.name: algorithm.model_class()},
-            # Records are read by full names
-            "argparse": SimpleNamespace(ArgumentParser=partial(argparse.ArgumentParser, allow_abbrev=False)),
-        },
-    }
-    theirs = {module: {name: vars(module)[name] for name in ours} for module, ours in replaced.items()}
-    before, sys.argv = sys.argv, [program, *arguments]
-    try:
-        for module, ours in replaced.items():
-            vars(module).update(ours)
-        rl_zoo3.train.train()
-    finally:
-        sys.argv = before
-        for module, names in theirs.items():
-            vars(module).update(names)

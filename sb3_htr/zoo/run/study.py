@@ -1,7 +1,9 @@
 """Where a study of ``sb3-htr optimize`` is kept: the file of a journal (``.log``), or the URL of a database."""
 
 from pathlib import Path
+from typing import Any
 
+import optuna
 import sqlalchemy
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
@@ -63,6 +65,30 @@ def check_is_there(storage: str) -> None:
     file = _file(storage)
     if file is not None and not Path(file).exists():
         raise ValueError(f"--storage is {storage}, and there is no file {file}: give that of `sb3-htr optimize`.")
+
+
+def check_is_of(storage: str, name: str | None, facts: dict[str, Any], note: bool) -> None:
+    """
+    Trials of several envs, methods or budgets have no best one, and settings of one are none of another.
+
+    :param storage: as given
+    :param name: of a study, which need not be there
+    :param facts: what a training, or a search, is of
+    :param note: write them into the study
+    :raises ValueError: if the study is of others; older ones do not say
+    """
+    try:
+        study = optuna.load_study(study_name=name, storage=opened(storage))
+    except KeyError:  # it is said elsewhere that there is none
+        return
+    for fact, value in facts.items():
+        if (known := study.user_attrs.get(fact, str(value))) != str(value):
+            raise ValueError(
+                f"The study {study.study_name!r} is of {fact} {known}, and not {value}: give --{fact} as there, or search "
+                "under another --study-name."
+            )
+        if note:
+            study.set_user_attr(fact, str(value))
 
 
 def without_password(storage: str) -> str:
