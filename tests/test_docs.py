@@ -25,7 +25,8 @@ def python_blocks(path: Path) -> str:
     return "\n".join(re.findall(r"^```python\n(.*?)^```", path.read_text(), flags=re.MULTILINE | re.DOTALL))
 
 
-PAGES = [path for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))) if python_blocks(path)]
+MANUAL = sorted((*ROOT.glob("docs/*.md"), *ROOT.glob("docs/results/*.md")))
+PAGES = [path for path in (ROOT / "README.md", *MANUAL) if python_blocks(path)]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
@@ -84,7 +85,7 @@ def test_tables_are_those_of_the_results(tool: ModuleType) -> None:
 
 
 def test_the_tests_that_repeat_a_figure_are_there() -> None:
-    commands = re.findall(r"`[^`]*\bpytest ([^`]+)`", "".join(page.read_text() for page in ROOT.glob("docs/*.md")))
+    commands = re.findall(r"`[^`]*\bpytest ([^`]+)`", "".join(page.read_text() for page in MANUAL))
     files = [word for command in commands for word in command.split() if word.startswith("tests/")]
     assert len(files) > 5 and all((ROOT / file).exists() for file in files), files
 

@@ -11,7 +11,8 @@ from sb3_htr.experiments.table import numbers, place, table
 from sb3_htr.zoo.run.method import OWN
 
 RESULTS = Path(__file__).parents[1] / "results"
-DOCUMENTS = (RESULTS.parent / "README.md", RESULTS.parent / "docs" / "results.md", RESULTS.parent / "docs" / "performance.md")
+DOCS = RESULTS.parent / "docs"
+DOCUMENTS = (RESULTS.parent / "README.md", *sorted(DOCS.glob("results/*.md")), DOCS / "performance.md")
 # The table of README.md, and of PEARL's own protocol: methods by their experiments; explorers with what is shown of them
 HEADLINES: dict[str, dict[str, tuple[str, ...]]] = {
     "headline": {
