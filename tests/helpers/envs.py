@@ -1,10 +1,13 @@
-"""Registered task envs, single and batched."""
+"""Registered task envs, single, batched and wrapped; and a robot that has no tasks."""
 
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import DummyVecEnv
 
+from helpers import ENV_ID
 from htr_envs import TaskEnv, TaskVectorEnv
 
 
@@ -27,3 +30,24 @@ def times_three(env: gym.Env) -> gym.Env:
     :return: the same with actions from -3 to 3
     """
     return gym.wrappers.RescaleAction(env, np.float32(-3), np.float32(3))
+
+
+def wrapped(wrapper: Any, **kwargs: Any) -> DummyVecEnv:
+    return DummyVecEnv([lambda: wrapper(gym.make(ENV_ID, **kwargs))] * 4)
+
+
+class Robot(gym.Env[Any, Any]):
+    """Has a body and rewards, and no tasks."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (2,))
+    action_space = spaces.Box(-1.0, 1.0, (2,), np.float64)
+
+    def __init__(self, length: int) -> None:
+        self.length, self.n_steps = length, 0
+
+    def reset(self, **kwargs: Any) -> Any:
+        return np.zeros(2, dtype=np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        self.n_steps += 1
+        return np.zeros(2, dtype=np.float32), float(self.n_steps == 3), self.n_steps % self.length == 0, False, {}
