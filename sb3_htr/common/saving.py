@@ -44,6 +44,10 @@ class CheckedFiles(BaseAlgorithm):
 
     #: Settings of the library's class that are none here, and why
     FOLLOWS: ClassVar[dict[str, str]] = {}
+    #: Settings of training, which a model that is exported to act has in place of its own
+    ACTS_WITH: ClassVar[dict[str, Any]] = {}
+    #: Attributes, beside settings, that it acts by: ``export`` writes them, and loading by ``--trust`` or ``load`` reads them
+    KEPT_TO_ACT: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def check_names(cls, given: Iterable[str], also: Iterable[str] = ()) -> None:

@@ -12,7 +12,6 @@ from filelock import Timeout
 
 import htr_envs  # noqa: F401 registers the envs
 from htr_envs.goal_env import find_hidden
-from sb3_htr.adaptation.explorers import to_explorer
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checkpoint import checkpoints
@@ -21,7 +20,6 @@ from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.evaluation_cache import FOLDER, Kept, digest_of_code
 from sb3_htr.experiments.log import logged
 from sb3_htr.experiments.protocol import check_evaluations, evaluate
-from sb3_htr.pearl.untrusted import EXPLORERS, check_is_ours
 from sb3_htr.zoo.commands import train
 from sb3_htr.zoo.run.agents import agent_at, file_stem, find_runs, is_finished, n_steps_of
 from sb3_htr.zoo.run.algorithm import Model
@@ -185,10 +183,7 @@ def _planned(cell: Cell) -> dict[str, Any]:
 
 def _check_loadable(cell: Cell) -> None:
     """Before it is trained: its model will be loaded as those of strangers are."""
-    settings = hyperparams_of(cell)
     try:
-        get_method(cell.method).algorithm.check_loadable(settings)
-        for name in [name for name in EXPLORERS if name in settings]:
-            check_is_ours(name, type(to_explorer(settings[name])).__module__)
+        get_method(cell.method).algorithm.check_loadable(hyperparams_of(cell))
     except ValueError as error:
         raise ValueError(f"{cell.label} could not be evaluated: {error.args[0].rstrip('.')}. Leave it out.") from None

@@ -108,6 +108,17 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
     return model
 
 
+def check_loadable(hyperparams: dict[str, Any]) -> None:
+    """
+    :param hyperparams: of a training to come
+    :raises Refused: if a file of its model would be
+    """
+    _policy_kwargs(hyperparams.get("policy_kwargs") or {})
+    for name in EXPLORERS:
+        if name in hyperparams:
+            check_is_ours(name, type(explorers.to_explorer(hyperparams[name])).__module__)
+
+
 def check_is_ours(what: str, module: str) -> None:
     """
     :param what: class of a model is meant

@@ -102,11 +102,8 @@ class Rival(CheckedFiles, Resumable):
     WRAPPERS: ClassVar[tuple[type[VecEnv], ...]] = ()
     #: Settings of its policy, whole numbers, beside those of SB3 and sb3-contrib, with the largest that a file may ask for
     POLICY_SIZES: ClassVar[dict[str, int]] = {}
-    #: Settings, whole numbers, that an agent which is loaded to act has of its training, and those that it has in their place
+    #: Settings, whole numbers, that an agent which is loaded to act has of its training
     ACTS_BY: ClassVar[tuple[str, ...]] = ()
-    ACTS_WITH: ClassVar[dict[str, Any]] = {}
-    #: Attributes, beside settings, that it acts by: ``export`` writes them, and loading by ``--trust`` or ``load`` reads them
-    KEPT_TO_ACT: ClassVar[tuple[str, ...]] = ()
     FOLLOWS: ClassVar[dict[str, str]] = {"use_sde": "its noise is drawn before a rollout, and in no checkpoint"}
     explorer = OwnWay()
 

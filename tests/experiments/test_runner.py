@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from torch import nn
 
 from helpers import ENV_ID
 from helpers.results import made_up
@@ -287,13 +288,17 @@ def test_plain_settings_of_a_variant_reach_its_evaluation(tmp_path: Path) -> Non
         np.testing.assert_array_equal(ours, theirs)
 
 
-def test_explorers_that_could_not_be_evaluated_are_not_trained_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_settings_that_could_not_be_evaluated_are_not_trained_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sb3_htr.experiments.runner.train.main", None)
     monkeypatch.setitem(EXPLORERS, "mine", type("Mine", (Prior,), {"__module__": "mine"}))
     (cell,) = Experiment("one", "", ENV_ID, 480, (Variant("htr-ser", "", {"train_explorer": "mine"}),), 1).cells()
     with pytest.raises(
         ValueError, match=r"could not be evaluated: its train_explorer is a class of its own, .* the file\. Leave"
     ):
+        run_cell(cell, tmp_path)
+    no_plain_data = {"policy_kwargs": {"activation_fn": nn.Tanh}}
+    (cell,) = Experiment("one", "", ENV_ID, 480, (Variant("htr-ser", "", no_plain_data),), 1).cells()
+    with pytest.raises(ValueError, match=r"could not be evaluated: its policy has the setting 'activation_fn'"):
         run_cell(cell, tmp_path)
 
 

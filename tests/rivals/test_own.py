@@ -320,4 +320,4 @@ def test_what_is_no_algorithm(changed: dict[str, Any], message: str, tmp_path: P
         algorithm.register_algorithm(**{**whole, **changed})
     assert before == algorithm.ALGORITHMS
     algorithm.register_algorithm(**whole)
-    assert algorithm.ALGORITHMS["mine"].model_class() is RL2
+    assert algorithm.ALGORITHMS["mine"].model_class is RL2

@@ -245,7 +245,7 @@ def test_what_is_sampled_of_a_rival_makes_a_model_of_it(name: str) -> None:
         trial = study.ask()
         sampled = space.sample(trial)
         assert sampled == space.convert(trial.params)
-        model = algorithm.model_class()(algorithm.model_class().DEFAULT_POLICY, ENV_ID, **sampled)
+        model = algorithm.model_class(algorithm.model_class.DEFAULT_POLICY, ENV_ID, **sampled)
         assert (model.gamma, model.ent_coef) == (1 - trial.params["one_minus_gamma"], trial.params["ent_coef"])
         assert model.policy_kwargs["net_arch"] == sampled["policy_kwargs"]["net_arch"]
     with pytest.raises(ValueError, match=r"The trial has kl_coef 0\.1, which sb3-htr optimize does not try"):

@@ -151,5 +151,5 @@ def test_every_block_of_hyperparameters_makes_a_model(algorithm: str) -> None:
     for name, settings in blocks.items():
         env = make_task_vec_env(ENV_ID if name == "default" else name, settings.pop("n_envs"))
         n_timesteps = settings.pop("n_timesteps")
-        model = ALGORITHMS[algorithm].model_class()(env=env, **settings)
+        model = ALGORITHMS[algorithm].model_class(env=env, **settings)
         assert n_timesteps >= env.num_envs * get_max_episode_steps(env) and model.policy is not None

@@ -53,7 +53,7 @@ def export(agent: TrainedAgent, path: Path) -> dict[str, Any]:
         model.critic.half()
         for target, parameter in zip(model.critic_target.parameters(), model.critic.parameters(), strict=True):
             target.data = parameter.data
-    kept = agent.algorithm.kept_to_act({*keywords_of(type(model)), *ALSO_KEPT} - {"tensorboard_log"})
+    kept = {*keywords_of(type(model)), *ALSO_KEPT} - {"tensorboard_log", *model.ACTS_WITH} | {*model.KEPT_TO_ACT}
     record = {key: agent.record[key] for key in KEPT_OF_RECORD if key in agent.record}
     which = "best on the validation tasks" if agent.path.stem == "best_model" else "last"
     record["command"] = training_command(agent.record)

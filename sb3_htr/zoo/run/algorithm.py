@@ -1,9 +1,9 @@
 """What the zoo has to know of an algorithm: where it is, what its settings are, and how a model of it is loaded."""
 
-import importlib
 import inspect
 import os
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,12 @@ from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.pearl import PEARL, load_untrusted
 from sb3_htr.pearl.horizon import timesteps_for
 from sb3_htr.pearl.policies import PEARLPolicy
+from sb3_htr.pearl.untrusted import check_loadable
 from sb3_htr.rivals.base import Rival
 from sb3_htr.rivals.off_policy import OffPolicyRival
 from sb3_htr.rivals.on_policy import OnPolicyRival
+from sb3_htr.rivals.rl2 import RL2
+from sb3_htr.rivals.sac_her import SACHER
 from sb3_htr.rivals.untrusted import load_untrusted as load_untrusted_rival
 from sb3_htr.rivals.untrusted import plain_policy
 from sb3_htr.zoo.run import search_space
@@ -33,37 +36,29 @@ Model = PEARL | Rival
 @dataclass(frozen=True)
 class Algorithm:
     """
-    A rival's.
+    One that is trained by a class of :mod:`sb3_htr.rivals`, or of one's own beside them.
 
     :param name: rl_zoo3's ``--algo``
-    :param module: that its class is in, imported when it is needed
-    :param class_name: of the class
+    :param model_class: of its models
     :param settings: YAML file with its hyperparameters; of the package's, the name alone
     :param about: how an agent of it comes to know its task, for model cards
     :param also_explores_by: explorer that scores name beside its own
     :param search_space: what ``optimize`` searches through, None for nothing
+    :param owners: of settings that are dicts, whose arguments these are, by name
     """
 
     name: str
-    module: str
-    class_name: str
+    model_class: type[Any]
     settings: str
     about: str
     also_explores_by: tuple[str, ...] = ()
     search_space: SearchSpace | None = None
+    owners: Mapping[str, type[Any]] = field(default_factory=dict)
 
     @property
     def settings_file(self) -> str:
         """Path of the YAML file."""
         return str(hyperparams_file(self.settings))
-
-    def model_class(self) -> type[Any]:
-        """
-        :return: the class
-        :raises ModuleNotFoundError: if a package that it needs is not installed
-        """
-        model_class: type[Any] = getattr(importlib.import_module(self.module), self.class_name)
-        return model_class
 
     def load(self, path: Path, record: dict[str, Any], env: gym.Env, device: str, trust: bool) -> Model:
         """
@@ -75,17 +70,17 @@ class Algorithm:
         :return: a model to adapt and evaluate with
         :raises ValueError: if it is no such file
         """
-        return self.model_class().load(path, device=device) if trust else self._load_untrusted(path, record, env, device)
+        return self.model_class.load(path, device=device) if trust else self._load_untrusted(path, record, env, device)
 
     def _load_untrusted(self, path: Path, record: dict[str, Any], env: gym.Env, device: str) -> Model:
-        return load_untrusted_rival(self.model_class(), path, record.get("hyperparams", {}), env, device)
+        return load_untrusted_rival(self.model_class, path, record.get("hyperparams", {}), env, device)
 
     def check_loadable(self, hyperparams: dict[str, Any]) -> None:
         """
         :param hyperparams: of a training to come
         :raises ValueError: if its model could be loaded by ``trust`` alone
         """
-        plain_policy(self.model_class(), hyperparams)
+        plain_policy(self.model_class, hyperparams)
 
     def load_to_train(self, path: str, env: VecEnv, device: th.device | str, **kwargs: Any) -> Any:
         """
@@ -98,20 +93,6 @@ class Algorithm:
         """
         raise refuse(path, "is unpickled to be trained on")
 
-    def kept_to_act(self, names: set[str]) -> set[str]:
-        """
-        :param names: of arguments and attributes
-        :return: what of them an agent that acts and trains no more has, and what it has beside
-        """
-        model_class = self.model_class()
-        return names - {*model_class.ACTS_WITH} | {*model_class.KEPT_TO_ACT}
-
-    def owners(self) -> dict[str, Any]:
-        """
-        :return: of settings that are within another one, whose arguments they are, by the name of that one
-        """
-        return {}
-
     def usual_timesteps(self, model: BaseAlgorithm) -> int:
         """
         :param model: as set up
@@ -121,22 +102,16 @@ class Algorithm:
 
 
 class PEARLAlgorithm(Algorithm):
-    """PEARL's, whose files can be read and trained on without running code of theirs."""
+    """PEARL, whose files can be trained on without running code of theirs."""
 
     def _load_untrusted(self, path: Path, record: dict[str, Any], env: gym.Env, device: str) -> Model:
         return load_untrusted(path, env, device)
 
     def check_loadable(self, hyperparams: dict[str, Any]) -> None:
-        pass
+        check_loadable(hyperparams)
 
     def load_to_train(self, path: str, env: VecEnv, device: th.device | str, **kwargs: Any) -> PEARL:
         return load_untrusted(path, env, device, **kwargs)
-
-    def kept_to_act(self, names: set[str]) -> set[str]:
-        return names
-
-    def owners(self) -> dict[str, Any]:
-        return {"replay_buffer_kwargs": MultiTaskReplayBuffer, "policy_kwargs": PEARLPolicy}
 
     def usual_timesteps(self, model: BaseAlgorithm) -> int:
         n_steps: int | None = getattr(model, "max_episode_steps", None)
@@ -148,25 +123,23 @@ ALGORITHMS = {
     for algorithm in (
         PEARLAlgorithm(
             "pearl",
-            "sb3_htr.pearl",
-            "PEARL",
+            PEARL,
             "pearl.yml",
             "It is not told its task: it tries a few episodes, infers the task from sparse rewards, and then solves it.",
             also_explores_by=("prior",),
             search_space=search_space.PEARL,
+            owners={"replay_buffer_kwargs": MultiTaskReplayBuffer, "policy_kwargs": PEARLPolicy},
         ),
         Algorithm(
             "rl2",
-            "sb3_htr.rivals.rl2",
-            "RL2",
+            RL2,
             "rl2.yml",
             "It is not told its task: it tries a few episodes, and its memory has what it found there.",
             search_space=search_space.RL2,
         ),
         Algorithm(
             "sac-her",
-            "sb3_htr.rivals.sac_her",
-            "SACHER",
+            SACHER,
             "sac_her.yml",
             "It is told its task, which makes it a ceiling for agents that are not.",
             search_space=search_space.SAC_HER,
@@ -213,10 +186,9 @@ def register_algorithm(
     path = Path(settings).resolve()
     if not path.is_file():
         raise FileNotFoundError(f"There is no file {path} with hyperparameters of {name!r}.")
-    algorithm = Algorithm(name, model_class.__module__, model_class.__qualname__, str(path), about, search_space=search_space)
-    if "." in algorithm.class_name:
-        raise ValueError(f"{algorithm.class_name} is within something: put the class at the top of its module.")
-    ALGORITHMS[name] = algorithm
+    if "." in model_class.__qualname__:
+        raise ValueError(f"{model_class.__qualname__} is within something: put the class at the top of its module.")
+    ALGORITHMS[name] = Algorithm(name, model_class, str(path), about, search_space=search_space)
 
 
 def check_folder_name(what: str, name: str) -> None:

@@ -180,9 +180,9 @@ class MetaExperimentManager(ExperimentManager):
             )
         if elsewhere := sorted(hyperparams.keys() & OPTIONS.keys()):
             raise ValueError(f"{elsewhere[0]} is no hyperparameter: give it by {OPTIONS[elsewhere[0]]}.")
-        model_class = self.method.algorithm.model_class()
+        model_class = self.method.algorithm.model_class
         own = {*keywords_of(model_class), *ZOO_SETTINGS}
-        for name, owner in self.method.algorithm.owners().items():
+        for name, owner in self.method.algorithm.owners.items():
             if misplaced := sorted(hyperparams.keys() & keywords_of(owner) - own):
                 raise ValueError(f"{misplaced[0]} is a setting within {name}: -params \"{name}:{{'{misplaced[0]}':...}}\".")
         check_keywords(model_class.__name__, hyperparams, model_class, also=ZOO_SETTINGS)

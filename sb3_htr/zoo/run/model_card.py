@@ -82,8 +82,8 @@ def snippet(algorithm: Algorithm, path: str, env: str, n_episodes: int) -> str:
     :param n_episodes: of an adaptation
     :return: Python that loads the agent and lets it adapt to a task
     """
-    name = algorithm.class_name
-    if hasattr(algorithm.model_class(), "adapt"):
+    name = algorithm.model_class.__name__
+    if hasattr(algorithm.model_class, "adapt"):
         return f"""from sb3_htr import {name}
 
 model = {name}.load({path})
@@ -92,7 +92,7 @@ agent = model.adapt(env, n_episodes={n_episodes}, task=env.get_wrapper_attr("tes
 print(agent.returns)  # of the adaptation episodes; agent.predict(observation) acts on this task
 """
     return f"""from sb3_htr import evaluate_adaptation
-from {algorithm.module} import {name}
+from {algorithm.model_class.__module__} import {name}
 
 model = {name}.load({path})
 env = {env}

@@ -38,7 +38,7 @@ def run_rl_zoo(
     :param resumed: folder of the run that goes on, None for a new one
     :param trust: whether files may have code run
     """
-    ALGOS[algorithm.name] = algorithm.model_class()
+    ALGOS[algorithm.name] = algorithm.model_class
     if algorithm.search_space is not None:
         HYPERPARAMS_CONVERTER[algorithm.name] = algorithm.search_space.convert
     manager = partial(MetaExperimentManager, method=method, resumed=resumed, trust=trust)
@@ -52,7 +52,7 @@ def run_rl_zoo(
         },
         rl_zoo3.train: {
             "ExperimentManager": manager,
-            "ALGOS": {algorithm.name: algorithm.model_class()},
+            "ALGOS": {algorithm.name: algorithm.model_class},
             # Records are read by full names
             "argparse": SimpleNamespace(ArgumentParser=partial(argparse.ArgumentParser, allow_abbrev=False)),
         },
