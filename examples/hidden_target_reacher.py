@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from htr_envs import TaskEnv, TaskFamily, Trajectory, at_step, check_reward_type
 from htr_envs.headless import open_no_window
-from htr_envs.task_env import BoolArray, FloatArray
+from htr_envs.task_env import BoolArray, FloatArray, l2_distance
 
 # As in Reacher-v5: targets are drawn from a disc of this radius, in metres
 REACH = 0.2
@@ -57,8 +57,7 @@ class HiddenTargetFamily(TaskFamily):
 
     @staticmethod
     def _distance(traj: Trajectory, task: ArrayLike) -> FloatArray:
-        x, y = np.moveaxis(traj.next_observations[..., FINGERTIP] - np.asarray(task, dtype=np.float32)[..., None, :], -1, 0)
-        return np.sqrt(x * x + y * y, dtype=np.float32)
+        return l2_distance(traj.next_observations[..., FINGERTIP], np.asarray(task, dtype=np.float32)[..., None, :])
 
 
 class HiddenTargetReacherEnv(TaskEnv):

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from htr_envs import Trajectory
 from htr_envs.dynamics import Dynamics, DynamicsEnv, DynamicsVectorEnv
-from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, at_step, check_reward_type
+from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, at_step, check_reward_type, l2_distance
 
 LINK = 0.5
 # Of the joints in a step, in rad
@@ -75,10 +75,7 @@ class TwoLinkArmFamily(TaskFamily):
 
     @staticmethod
     def _distance(traj: Trajectory, task: ArrayLike) -> FloatArray:
-        goal = np.asarray(task, dtype=np.float32)[..., None, :]
-        # along each axis in turn, so that sums do not depend on how many goals there are
-        x, y = (traj.next_observations[..., TIP][..., i] - goal[..., i] for i in (0, 1))
-        return np.sqrt(x * x + y * y, dtype=np.float32)
+        return l2_distance(traj.next_observations[..., TIP], np.asarray(task, dtype=np.float32)[..., None, :])
 
 
 class TwoLinkArmDynamics(Dynamics[TwoLinkArmFamily]):

@@ -21,7 +21,7 @@ from htr_envs.goal_env_source import (
     without_goal,
 )
 from htr_envs.headless import open_no_window
-from htr_envs.task_env import BoolArray, FloatArray, TaskEnv, TaskFamily, Trajectory, at_step, check_reward_type
+from htr_envs.task_env import BoolArray, FloatArray, TaskEnv, TaskFamily, Trajectory, at_step, check_reward_type, l2_distance
 
 NAMESPACE = "HiddenGoal"
 NOT_BEGUN = -1
@@ -101,9 +101,7 @@ class HiddenGoalFamily(TaskFamily):
         dense = self.source.dense()
         if dense is not None:
             return goal_rewards(dense, achieved, goals)
-        # component by component: the same bits for any batch shape
-        squares = [(achieved[..., i] - goals[..., i]) ** 2 for i in range(goals.shape[-1])]
-        return -np.sqrt(sum(squares, np.float32(0.0)))
+        return -l2_distance(achieved, goals)
 
 
 class HiddenGoalEnv(TaskEnv):

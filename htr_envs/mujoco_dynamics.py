@@ -43,7 +43,8 @@ FRAME_WIDTH, FRAME_HEIGHT = 640, 400
 AZIMUTH, ELEVATION = 90.0, -45.0
 # How far away, as multiples of the width and the depth of where they are
 DISTANCE = np.array([1.2, 1.45])
-# Those with threads, and threads of a process that this one was forked from: who puts them away waits for them for ever
+# Dynamics with threads; and what a forked process inherited of them, which is kept for good: to delete it is to wait for ever
+# for threads that only the parent process has
 THREADED: WeakSet[MujocoDynamics] = WeakSet()
 LOST: list[Any] = []
 

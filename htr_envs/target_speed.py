@@ -9,7 +9,7 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from htr_envs.dynamics import Dynamics, DynamicsEnv, DynamicsVectorEnv
-from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, at_step, check_reward_type
+from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, at_step, check_reward_type, l2_distance
 from htr_envs.task_sets import draw_task_sets
 
 FRICTION = np.float32(0.95)
@@ -87,9 +87,7 @@ class TargetSpeedFamily(TaskFamily):
 
     @staticmethod
     def _speed(velocity: FloatArray) -> FloatArray:
-        # not np.linalg.norm: its sum may be ordered by memory layout, and rewards must be the same bits for any batch shape
-        speed: FloatArray = np.sqrt(velocity[..., 0] ** 2 + velocity[..., 1] ** 2, dtype=np.float32)
-        return speed
+        return l2_distance(velocity, np.zeros(2, dtype=np.float32))
 
     def _error(self, traj: Trajectory, task: ArrayLike) -> FloatArray:
         error: FloatArray = np.abs(self._speed(traj.next_observations) - np.asarray(task, dtype=np.float32)[..., None, 0])

@@ -64,6 +64,19 @@ def at_step(values: FloatArray, index: ArrayLike) -> FloatArray:
     return np.take_along_axis(values, indices, axis=-2)[..., 0, :]
 
 
+def l2_distance(positions: FloatArray, others: FloatArray) -> FloatArray:
+    """Euclidean distance between positions, the same bits for any batch shape.
+
+    :param positions: shape (..., dim).
+    :param others: shape (..., dim); leading axes broadcast.
+    :return: shape (...), float32.
+    """
+    # column by column, which is three times as fast; not np.linalg.norm: its sum may be ordered by memory layout
+    first, *rest = (np.square(positions[..., i] - others[..., i]) for i in range(others.shape[-1]))
+    result: FloatArray = np.sqrt(sum(rest, first), dtype=np.float32)
+    return result
+
+
 class TaskFamily(TaskDistribution):
     """A distribution of tasks with their rewards: small, picklable, stateless.
 

@@ -4,7 +4,6 @@ Adapts the agents in trained_agents/ to all test tasks and writes the table in i
 Scores are kept in trained_agents/scores.json with the checksum of the file that they are of: only what is missing is measured.
 """
 
-import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,8 @@ from tables import fill
 
 from sb3_htr.adaptation.evaluation import first_success, record_adaptation
 from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.digest import sha256
+from sb3_htr.common.markdown import markdown_table
 from sb3_htr.zoo.run.agents import agent_at
 from sb3_htr.zoo.run.method import methods
 
@@ -22,14 +23,6 @@ HEAD = ("file", "env steps", "explorer", "return of the 20th episode", "tasks so
 N_EPISODES = 20
 # Beside an agent's own one: PEARL's protocol, with either prior
 EXPLORERS = ("learned-prior", "prior")
-
-
-def checksum(path: Path) -> str:
-    """
-    :param path: file
-    :return: its SHA-256
-    """
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def files() -> list[Path]:
@@ -68,7 +61,7 @@ def read_scores() -> dict[str, dict[str, Any]]:
     :return: checksum and scores of each file that has not changed since
     """
     known = json.loads(SCORES.read_text()) if SCORES.exists() else {}
-    now = {str(path.relative_to(AGENTS)): checksum(path) for path in files()}
+    now = {str(path.relative_to(AGENTS)): sha256(path) for path in files()}
     return {name: row for name, row in known.items() if now.get(name) == row["sha256"]}
 
 
@@ -77,18 +70,19 @@ def table(scores: dict[str, dict[str, Any]]) -> str:
     :param scores: of :func:`read_scores`
     :return: Markdown: a line for each agent and explorer, then the commands that made them
     """
-    lines, commands = ["| " + " | ".join(HEAD) + " |", "| --- " * len(HEAD) + "|"], []
+    lines: list[list[str]] = []
+    commands: list[str] = []
     for path in files():
         name, record = str(path.relative_to(AGENTS)), agent_at(path).record
+        agent = [f"`{name}`", f"{record['num_timesteps']:,}"]
         measured = scores.get(name, {"explorers": {}})["explorers"]
         for explorer, (last, solved, first) in sorted(measured.items()):
-            steps = f"{record['num_timesteps']:,}"
-            lines.append(f"| `{name}` | {steps} | `{explorer}` | {last:.2f} | {solved:.0%} | {first:.1f} |")
+            lines.append([*agent, f"`{explorer}`", f"{last:.2f}", f"{solved:.0%}", f"{first:.1f}"])
         if not measured:
-            lines.append(f"| `{name}` | {record['num_timesteps']:,} | | not measured by this version | | |")
+            lines.append([*agent, "", "not measured by this version", "", ""])
         commands.append(record["command"])
     made = "Earlier code made them (targets of one step; its commit is not in the files), by"
-    return "\n".join(lines) + f"\n\n{made}\n\n" + "".join(f"    {command}\n" for command in commands) + "\n"
+    return f"{markdown_table(HEAD, lines)}\n\n{made}\n\n" + "".join(f"    {command}\n" for command in commands) + "\n"
 
 
 def main() -> None:
@@ -97,7 +91,7 @@ def main() -> None:
     for path in files():
         name = str(path.relative_to(AGENTS))
         known = scores.get(name, {"explorers": {}})["explorers"]
-        scores[name] = {"sha256": checksum(path), "explorers": measure(path, known)}
+        scores[name] = {"sha256": sha256(path), "explorers": measure(path, known)}
     with atomic_path(SCORES) as temporary:
         temporary.write_text(json.dumps(scores, indent=1, sort_keys=True) + "\n")
     fill([AGENTS / "README.md"], {"agents": table(scores)})

@@ -6,6 +6,8 @@ from typing import Any
 
 from tables import fill
 
+from sb3_htr.common.markdown import markdown_table
+
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 DOCUMENTS = [ROOT / "docs" / name for name in ("performance.md", "scaling.md", "rivals.md")]
@@ -16,13 +18,12 @@ def table(content: dict[str, Any]) -> str:
     :param content: of a result file
     :return: Markdown table, one line for each figure
     """
-    head = ["what", "ours", "alternative", "ratio", "goal", "against"]
-    lines = [head, ["---"] * len(head)]
+    lines: list[list[str]] = []
     for row in content["rows"]:
         ratio, goal = (f"{row[key]:.2f}" if row[key] else "" for key in ("ratio", "goal"))
         ours, reference = (f"{row[key]:,.{_decimals(row[key])}f}" if row[key] else "" for key in ("ours", "reference"))
         lines.append([row["name"], f"{ours} {row['unit']}", reference, ratio, goal, row["against"]])
-    text = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    text = markdown_table(["what", "ours", "alternative", "ratio", "goal", "against"], lines)
     return f"{text}\n\n{_origin(content)}\n"
 
 
@@ -47,9 +48,8 @@ def shares(content: dict[str, Any]) -> str:
     :param content: of a profile
     :return: Markdown table
     """
-    lines = ["| part | share of wall time |", "| --- | --- |"]
-    lines += [f"| {row['name'].removeprefix('aten::')} | {row['share']:.1%} |" for row in content["shares"]]
-    return "\n".join(lines) + f"\n\n{_origin(content)}\n"
+    lines = [[row["name"].removeprefix("aten::"), f"{row['share']:.1%}"] for row in content["shares"]]
+    return f"{markdown_table(['part', 'share of wall time'], lines)}\n\n{_origin(content)}\n"
 
 
 def _origin(content: dict[str, Any]) -> str:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.markdown import markdown_table
 from sb3_htr.experiments.protocol import MIN_RUNS
 from sb3_htr.experiments.table import numbers, place, table
 from sb3_htr.zoo.run.method import OWN
@@ -60,8 +61,7 @@ def headline(summaries: dict[str, dict[str, Any]], methods_of: dict[str, tuple[s
     """
     shown = [(explorer, metric) for explorer, metrics in EXPLORERS.items() for metric in metrics]
     heads = [f"`{explorer}`: {EXPLORERS[explorer][metric]}" for explorer, metric in shown]
-    lines = [["env", "env steps", "runs", "method", *heads]]
-    lines.append(["---"] * len(lines[0]))
+    lines: list[list[str]] = []
     for name, methods in methods_of.items():
         scores: dict[tuple[str, ...], dict[tuple[str, str], str]] = {}
         for row in summaries.get(name, {"rows": []})["rows"]:
@@ -69,7 +69,7 @@ def headline(summaries: dict[str, dict[str, Any]], methods_of: dict[str, tuple[s
                 key = (row["env"], f"{row['env_steps']:,}", str(row["n_seeds"]), row["variant"])
                 scores.setdefault(key, {})[row["explorer"], row["metric"]] = _interval(row)
         lines += [[*key, *(cells.get(column, "") for column in shown)] for key, cells in scores.items()]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+    return markdown_table(["env", "env steps", "runs", "method", *heads], lines) + "\n"
 
 
 def differences(summaries: dict[str, dict[str, Any]], methods_of: dict[str, tuple[str, ...]]) -> str:
@@ -101,7 +101,7 @@ def differences(summaries: dict[str, dict[str, Any]], methods_of: dict[str, tupl
     # Without columns that say nothing
     shown = [column for column in zip(*lines, strict=True) if any(column[1:]) or len(lines) == 1]
     head, *body = zip(*shown, strict=True)
-    return "\n".join("| " + " | ".join(line) + " |" for line in (head, ["---"] * len(head), *body)) + "\n"
+    return markdown_table(head, body) + "\n"
 
 
 def _times(row: dict[str, Any]) -> str:

@@ -1,6 +1,5 @@
 """Checkpoints, folders of plain data: never half written, damage is noticed, and reading one runs no code."""
 
-import hashlib
 import json
 import os
 import warnings
@@ -10,6 +9,7 @@ from typing import Any
 import torch as th
 
 from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.digest import sha256
 from sb3_htr.common.versions import versions
 
 FORMAT = 1
@@ -34,7 +34,7 @@ def write_checkpoint(folder: str | os.PathLike[str], state: dict[str, Any]) -> N
         manifest = {
             "format": FORMAT,
             "versions": versions(),
-            "sha256": {STATE: _sha256(temporary / STATE)},
+            "sha256": {STATE: sha256(temporary / STATE)},
         }
         (temporary / MANIFEST).write_text(json.dumps(manifest, indent=1))
 
@@ -55,7 +55,7 @@ def read_checkpoint(folder: str | os.PathLike[str]) -> dict[str, Any]:
     if found != FORMAT:
         raise DamagedCheckpoint(f"{folder} has format {found}, expected {FORMAT}: read it with sb3_htr {writer}, its writer.")
     try:
-        intact = _sha256(folder / STATE) == expected
+        intact = sha256(folder / STATE) == expected
     except OSError:
         intact = False
     if not intact:
@@ -65,14 +65,6 @@ def read_checkpoint(folder: str | os.PathLike[str]) -> dict[str, Any]:
     except Exception:  # whatever a stranger can put into a file, with its checksum beside it
         raise DamagedCheckpoint(f"{folder / STATE} is not what sb3-htr writes, and may run code: it was not read.") from None
     return state
-
-
-def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
-    with open(path, "rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
 
 
 def checkpoints(run: Path) -> list[Path]:

@@ -71,7 +71,8 @@ def cut_monitor_files(run: Path, folder: Path, sizes: dict[str, int]) -> None:
     :param sizes: of the monitor files when it was made
     """
     kept = f".until_{folder.name}.monitor.csv"
-    # What was cut before comes first: it may be of a later checkpoint, and begins with what this one had
+    # Longest names first: a file that was cut at a later checkpoint begins with the episodes before this one, while the file
+    # that it was cut from may have been begun anew since
     for path in sorted(run.glob("*.monitor.csv"), key=lambda path: len(path.name), reverse=True):
         if path.name.endswith(kept) or (".until_" in path.name and path.name in sizes):
             continue

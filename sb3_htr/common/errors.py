@@ -1,4 +1,4 @@
-"""What an error says, in one line, and of what it is."""
+"""Exceptions by what they are about, and what they say in one line."""
 
 import struct
 

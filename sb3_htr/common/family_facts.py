@@ -29,7 +29,7 @@ def family_facts(family: TaskFamily) -> dict[str, str]:
         if type(value) in (list, tuple, dict) or _says_nothing(value):
             return of_parts(value)
         with np.printoptions(threshold=sys.maxsize, floatmode="unique"):
-            # What does not say what it is names its address, numpy in capitals
+            # The text of an object may end in its address, which differs between processes; numpy writes it in capitals
             return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(value))
 
     def of_parts(value: Any) -> str:

@@ -70,7 +70,7 @@ class _Stack(th.autograd.Function):
         for layer in layers:
             weight, *others = (next(remaining) for _ in range(layer.n_parameters))
             y, kept = _forward(x, layer, weight, *others)
-            # Who is not rectified may overwrite what it is given, as with torch's layers
+            # Without ReLU, the output is not needed again: whoever gets it may overwrite it, as with torch's layers
             saved += [x, y if layer.rectified else None, weight, *others[1:], *kept]
             x = y
         ctx.layers = layers

@@ -23,7 +23,7 @@ class MetaProgressBarCallback(ProgressBarCallback):
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
-        # Of a process before, a checkpoint may have times of another clock
+        # Those restored from a checkpoint are times of another process, whose clock began elsewhere
         self._n_updates, self._rollout_start, self._rollout_end = 0, 0.0, 0.0
         self.pbar.smoothing = 0.05
         # A model that does not tell has SB3's bar

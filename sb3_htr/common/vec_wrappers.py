@@ -30,7 +30,7 @@ class PatientResultsWriter(ResultsWriter):
 
 
 class CopiedWrapper(VecEnvWrapper):
-    """A wrapper of which a deep copy can be made. SB3's have none: whoever asks for it is passed on to the env within."""
+    """A wrapper that can be deep-copied; SB3's cannot, because they pass on to the env within what ``copy`` asks of them."""
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "CopiedWrapper":
         result = memo[id(self)] = type(self).__new__(type(self))

@@ -1,6 +1,5 @@
 """Evaluations of a final model are kept as they end: all of them together may take longer than its training."""
 
-import hashlib
 import json
 import sys
 from collections.abc import Callable, Iterable
@@ -10,26 +9,17 @@ import numpy as np
 
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.digest import sha256
 from sb3_htr.experiments.cell import REMOVE, KwArgs, file_name
 
 FOLDER = "evaluated"
 
 
-def digest(files: Iterable[Path]) -> str:
-    """
-    :param files: to read
-    :return: of their contents
-    """
-    whole = hashlib.sha256()
-    for file in files:
-        whole.update(file.read_bytes())
-    return whole.hexdigest()
-
-
 def digest_of_code(modules: Iterable[str]) -> str:
     """
     :param modules: names of modules and packages that are imported
-    :return: of their files; of a module within a package, of all of the package, which it may import, and of the assets there
+    :return: SHA-256 of their files; of a module within a package, of all files of the package: the module may import or read
+        any of them
     """
     files: list[Path] = []
     for module in modules:
@@ -37,7 +27,7 @@ def digest_of_code(modules: Iterable[str]) -> str:
         folders = [Path(folder) for folder in getattr(outermost, "__path__", ())]
         inside = [file for folder in folders for file in sorted(folder.rglob("*")) if file.is_file()]
         files += [file for file in inside if file.suffix != ".pyc"] if folders else [Path(outermost.__file__ or "")]
-    return digest(files)
+    return sha256(*files)
 
 
 class Kept:
@@ -49,7 +39,7 @@ class Kept:
 
     def __init__(self, run: Path, model: Path, *about: str) -> None:
         self.folder = run / FOLDER
-        self._of = json.dumps([digest([model]), *about])
+        self._of = json.dumps([sha256(model), *about])
 
     def __call__(self, name: str, make: Callable[[], KwArgs]) -> KwArgs:
         """

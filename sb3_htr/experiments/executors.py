@@ -43,7 +43,7 @@ class Processes(ThreadPoolExecutor):
 
 
 def _end_with_parent() -> None:
-    """What it runs goes on from its checkpoint, where the driver was killed."""
+    """End this process when its parent was killed: the next driver lets its cell go on from a checkpoint."""
 
     def watch() -> None:
         parent = parent_process()

@@ -28,18 +28,12 @@ SOLVED_SHARE = 0.8
 Raw = Mapping[str, np.ndarray]
 
 
-def _made(name: str, make: Callable[[], KwArgs]) -> KwArgs:
-    return make()
-
-
-def evaluate(
-    cell: Cell, model: Model, trained_with: Any = None, keep: Callable[[str, Callable[[], KwArgs]], KwArgs] = _made
-) -> KwArgs:
+def evaluate(cell: Cell, model: Model, trained_with: Any, keep: Callable[[str, Callable[[], KwArgs]], KwArgs]) -> KwArgs:
     """
     :param cell: says which evaluations
     :param model: at the end of its training
-    :param trained_with: explorer as the hyperparameters of its training give it. Its settings hold where it is meant; those
-        that are not given are today's defaults, as for all explorers, whatever they were when the model was trained
+    :param trained_with: explorer in the hyperparameters of its training, whose settings are used where an evaluation is by the
+        explorer of that name. All others are the defaults of this version, whatever they were when the model was trained
     :param keep: of the name of an evaluation and what makes its arrays to these arrays, which may be there already
     :return: ``returns_<evaluation>`` float32 and ``successes_<evaluation>`` bool, (n_eval_seeds, n_tasks, n_episodes); and
         ``calibration``, see :func:`sb3_htr.experiments.calibration.calibration`

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from sb3_htr.common.markdown import markdown_table
 from sb3_htr.experiments.protocol import MIN_RUNS
 
 COLUMNS = {
@@ -53,9 +54,8 @@ def table(summary: dict[str, Any]) -> str:
     # Interquartile means of three runs trim none
     middle = "IQM over runs (of three or fewer, their mean)" if min(row["n_seeds"] for row in rows) <= 3 else "IQM over runs"
     commits = summary["commit"] if later == summary["commit"] else f"{summary['commit']}, evaluated by {later}"
-    text = "\n".join("| " + " | ".join(line) + " |" for line in (head, ["---"] * len(head), *body))
     return (
-        f"{text}\n\n{about} Final models on the test tasks: {middle}, "
+        f"{markdown_table(head, body)}\n\n{about} Final models on the test tasks: {middle}, "
         f"95 % bootstrap interval over runs, tasks and {summary.get('n_eval_seeds', 1)} evaluation seeds. "
         f"`{summary['command']}`, commit {commits}, {summary['machine']}.\n"
     )

@@ -19,7 +19,7 @@ from sb3_htr.htr.episode_store import EpisodeStore
 from sb3_htr.htr.groups import ascending, first_rows, stratified_draw
 from sb3_htr.htr.n_step import n_step_returns, steps_ahead
 from sb3_htr.htr.relabel import RELABELLERS, Relabeller
-from sb3_htr.htr.reward_hook import check_achieved, check_rewards, check_rewards_told
+from sb3_htr.htr.reward_hook import check_achieved, check_returned_rewards, check_rewards_told
 from sb3_htr.htr.transitions import Transitions
 
 # Of what was saved, how many rewards are compared with those of the task family
@@ -290,23 +290,21 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             )
         episodes = self._empty_store()
         episodes.load_state_dict(state["episodes"])
-        self._check_rewards(self.task_family, episodes)
+        self.check_rewards_of(self.task_family, episodes)
         self.relabeller.load_state_dict(state["relabeller"])
         self.episodes = episodes
         for generator, saved in zip((self._rng, self.relabel_rng), state["random"], strict=True):
             set_generator_state(generator, saved)
         self.discard_open_episodes()
 
-    def check_rewards_of(self, family: TaskFamily) -> None:
+    def check_rewards_of(self, family: TaskFamily, episodes: EpisodeStore) -> None:
         """
         Attributes do not tell all that a reward depends on.
 
         :param family: that is to tell rewards of what is stored
+        :param episodes: the buffer's own, or those that are to replace them
         :raises ValueError: if it tells others than were stored
         """
-        self._check_rewards(family, self.episodes)
-
-    def _check_rewards(self, family: TaskFamily, episodes: EpisodeStore) -> None:
         index, columns = episodes.index(), self.transitions
         if len(index.rows) == 0 or missing_hook(family) is not None:
             return
@@ -471,5 +469,5 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         """
         traj = self.transitions.trajectory(rows.take(where, axis=0)[:, None])
         reward = self.task_family.compute_reward(traj, tasks, reward_type=reward_type)
-        check_rewards(reward, traj, f" with reward_type={reward_type!r}, for a hindsight task,")
+        check_returned_rewards(reward, traj, f" with reward_type={reward_type!r}, for a hindsight task,")
         rows[where, self.transitions.reward] = reward[:, 0]

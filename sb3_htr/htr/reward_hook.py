@@ -14,7 +14,7 @@ from sb3_htr.htr.transitions import Transitions
 WORTH = 0.3, 30.0
 # Share of the successes that may be worth nothing: a reward that falls to 0 at the rim of a goal rounds some of them to it
 UNPAID = 0.1
-# How many episodes are told of as a whole, too
+# Of how many episodes the hook is also asked as a whole, to see that it says the same as of their steps one by one
 MAX_WHOLE = 8
 
 
@@ -36,7 +36,7 @@ def check_reward_hook(
     tasks = family.train_tasks[task]
     traj = columns.trajectory(rows[:, None])
     rewards = np.asarray(family.compute_reward(traj, tasks))
-    check_rewards(rewards, traj)
+    check_returned_rewards(rewards, traj)
     given, computed = rows[:, columns.reward], rewards[:, 0]
     successes = np.asarray(family.is_success(traj, tasks))
     if successes.dtype != np.bool_:
@@ -65,7 +65,7 @@ def check_reward_hook(
         )
 
 
-def check_rewards(rewards: np.ndarray, traj: Any, when: str = "") -> None:
+def check_returned_rewards(rewards: np.ndarray, traj: Any, when: str = "") -> None:
     """
     :param rewards: what the reward hook returned
     :param traj: steps, (n, 1, ...), that it was asked for
@@ -156,7 +156,7 @@ def _check_worth(family: TaskFamily, columns: Transitions, last: np.ndarray) -> 
             "not happen. Run htr_envs.check_task_env(env) to find out more."
         )
     reward = family.compute_reward(traj, achieved)
-    check_rewards(reward, traj, " for the task that hindsight_task named")
+    check_returned_rewards(reward, traj, " for the task that hindsight_task named")
     worth = task_reward(reward, traj.task_free_reward)[:, 0]
     if (worth <= 0).any():
         i = int(worth.argmin())

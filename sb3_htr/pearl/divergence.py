@@ -14,7 +14,7 @@ class DivergedError(FloatingPointError):
     """Training cannot go on: a loss or a weight is not finite."""
 
 
-def check_finite(networks: nn.Module, losses: Mapping[str, float], n_updates: int, num_timesteps: int) -> None:
+def check_not_diverged(networks: nn.Module, losses: Mapping[str, float], n_updates: int, num_timesteps: int) -> None:
     """
     :param networks: whose weights are checked
     :param losses: means over the latest updates

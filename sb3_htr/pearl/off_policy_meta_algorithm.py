@@ -119,7 +119,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
             stats_window_size=(kwargs.get("stats_window_size", 1), 1),
         )
         check_mappings(replay_buffer_kwargs=replay_buffer_kwargs, policy_kwargs=policy_kwargs)
-        if not isinstance(policy, str | type):  # of another class, CheckedFiles says so
+        if not isinstance(policy, str | type):  # a class of another kind is refused by CheckedFiles
             check_class("policy", policy, PEARLPolicy)
         seed = checked_seed(seed)
         self.explorer, self.train_explorer = to_explorer(explorer), to_explorer(train_explorer)
@@ -129,7 +129,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
             env = self._wrap_env(env)
             checks.check_spaces(env)
         policy_class = self.policy_aliases.get(policy) if isinstance(policy, str) else policy
-        if policy_class is not None:  # else it does so, too
+        if policy_class is not None:  # an unknown name is refused by CheckedFiles
             check_keywords("policy_kwargs", policy_kwargs or {}, policy_class, without=GIVEN_TO_POLICY)
         super().__init__(
             policy=policy,
@@ -287,7 +287,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         if self.replay_buffer is not None and self.replay_buffer.size() > 0:
             known = family_facts(self.replay_buffer.task_family)
             check_same_family(known, family_facts(family), "The env")
-            self.replay_buffer.check_rewards_of(family)
+            self.replay_buffer.check_rewards_of(family, self.replay_buffer.episodes)
             if n_steps > self.replay_buffer.max_episode_steps:
                 raise ValueError(
                     f"The env's time limit is {n_steps} steps, and what was collected has room for episodes of "

@@ -13,7 +13,7 @@ from sb3_htr.common.segments import repeat_segments
 from sb3_htr.common.settings import LOWEST, check_flags, check_numbers
 from sb3_htr.common.type_aliases import MultiTaskSamples, RewardLabels
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
-from sb3_htr.pearl.divergence import PosteriorWatch, check_finite
+from sb3_htr.pearl.divergence import PosteriorWatch, check_not_diverged
 from sb3_htr.pearl.encoder import ContextEncoder, kl_to_prior
 from sb3_htr.pearl.graphed_update import FixedUpdate, GraphedUpdate, Outcome, can_be_captured
 from sb3_htr.pearl.matmul import PRECISIONS, matmul_precision
@@ -234,7 +234,7 @@ class PEARL(OffPolicyMetaAlgorithm):
         with matmul_precision(self.matmul_precision):
             means, logs = zip(*(self._update(batch_size, fixed) for _ in range(gradient_steps)), strict=True)
         log_means = {key: th.stack([log[key] for log in logs]).mean().item() for key in logs[0]}
-        check_finite(self.policy, log_means, self._n_updates, self.num_timesteps)
+        check_not_diverged(self.policy, log_means, self._n_updates, self.num_timesteps)
         self._posterior_watch.check(log_means["kl_divergence"])
         for key, value in log_means.items():
             self.logger.record(f"train/{key}", value)

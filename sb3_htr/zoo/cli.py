@@ -106,7 +106,7 @@ def _nobody_reads() -> bool:
 
 
 def _is_closed(stream: TextIO) -> bool:
-    """Whether nobody reads a pipe; of one that keeps nothing to itself, flushing does not tell."""
+    """Whether the reader of a pipe is gone; flushing does not reveal it where the stream has no buffer."""
     if not hasattr(select, "poll"):
         return False
     try:

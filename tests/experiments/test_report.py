@@ -279,6 +279,6 @@ def test_a_final_model_adapts_to_the_test_tasks_once_with_each_seed(monkeypatch:
     variant = Variant("htr-ser", env_kwargs={"n_test_tasks": 4, "goal_distance": 1.5})
     evaluations = by(("prior",), {}, {"goal_distance": 2.0})
     (cell,) = Experiment("one", "", ENV_ID, 480, (variant,), 1, evaluations=evaluations).cells()
-    arrays = protocol.evaluate(cell, None)  # type: ignore[arg-type]
+    arrays = protocol.evaluate(cell, None, None, lambda name, make: make())  # type: ignore[arg-type]
     assert asked == [(seed, distance) for distance in (1.5, 2.0) for seed in (1, 2, 3, 4, 5)]
     assert arrays["returns_prior"].shape == (5, 4, 20)

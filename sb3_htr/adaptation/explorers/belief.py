@@ -24,14 +24,14 @@ class Belief(ParticleExplorer):
     """
     The explorer that is the default at meta-test.
 
-    First it searches: z is that of the particle whose episode would earn most, and soonest: what the belief expects its
-    rewarded steps to earn, times the critics' value of going there from here, beside what unrewarded steps return; chosen anew
-    within an episode. (Where no value is above that, as with critics that learn from a dense proxy, beside the lowest
-    one.) What several z found cannot be repeated: every other episode searches, until one with a single z has returned half as
-    much. The others have a single z, the one that promises the largest return: of a particle, under the same belief; of the
-    best episode so far, what it returned. The encoder's posterior mean, given a new best episode, is tried once. Where an
-    episode begins elsewhere each time, a z that was good may be a bad one: an episode that is not rewarded and whose value, as
-    it goes on, is not what it was at the start, searches on to its end.
+    First it searches: several times in an episode, it chooses the z of the particle with the largest product of two numbers:
+    what the belief expects a rewarded step of its episode to earn, and the critics' value of acting with it from here on, less
+    the value of unrewarded steps. (Where no value is above that, as with critics that learn from a dense proxy, less the
+    lowest of them.) What several z found cannot be repeated: every other episode searches, until one with a single z has
+    returned half as much. The others have a single z, the one that promises the largest return: of a particle, under the same
+    belief; of the best episode so far, what it returned. The encoder's posterior mean, given a new best episode, is tried
+    once. Where an episode begins elsewhere each time, a z that was good may be a bad one: an episode that is not rewarded and
+    whose value, as it goes on, is not what it was at the start, searches on to its end.
 
     :param margin: a particle must promise so many times what the best episode returned, to be tried in its place; 1 or more
     :param kept: in [0, 1], when an episode with one z keeps its word: of what was found, the share that it must return to end

@@ -24,8 +24,8 @@ def claims_among(objects: Objects) -> Objects:
 
 class Claim:
     """
-    The newest object in a folder is its owner's, who renews it while at work, and leaves it :data:`FREE` in the end. What
-    :class:`Watch` saw nobody renew is nobody's, too.
+    A lock on a folder: its newest object belongs to the owner, who rewrites it while at work, and writes :data:`FREE` into it
+    at the end. A claim that was not rewritten for long, as :class:`Watch` tells, may be taken over as a free one may.
 
     :param files: of the store
     :param folder: in it

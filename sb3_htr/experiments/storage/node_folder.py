@@ -19,7 +19,7 @@ def node_folder() -> Iterator[Path]:
     """
     A temporary folder, removed at the end. Those that killed processes of the same user have left are removed before.
 
-    :return: of the folder
+    :return: context manager that gives the path of the folder
     """
     user = Path(gettempdir(), f"sb3-htr-{os.getuid() if hasattr(os, 'getuid') else 0}{LOCK}")
     with SystemLock(user).acquire():  # a new folder is not locked yet

@@ -58,7 +58,7 @@ class TrainingTaskRelabelling(HindsightBuffers):
     def draw(self, tasks: np.ndarray) -> HindsightDraw:
         self._take_in()
         buffer, known = self.buffer, self.episodes.index().tasks
-        # Whether they were played or not: what was relabelled first would wait until they are
+        # Also tasks that no episode was collected on yet, as experience may be relabelled for them before
         chosen = known[buffer.relabel_rng.integers(len(known), size=len(tasks))]
         return self.draw_from(chosen, buffer.task_family.train_tasks[chosen])
 

@@ -93,6 +93,18 @@ def add_adaptation_arguments(parser: argparse.ArgumentParser, n_episodes: int) -
     group.add_argument("--seed", type=int, default=0, help="of env, z and sampled actions (default: 0)")
 
 
+def add_task_arguments(parser: argparse.ArgumentParser) -> None:
+    """
+    :param parser: gets the arguments that say which tasks to play
+    """
+    add_adaptation_arguments(parser, n_episodes=8)
+    group = parser.add_argument_group("tasks")
+    group.add_argument("--n-tasks", type=int, default=3, metavar="N", help="the first N of the set (default: 3)")
+    group.add_argument("--task", type=int, nargs="+", metavar="N", help="numbers of tasks in the set, from 1 on")
+    group.add_argument("-n", "--n-timesteps", type=int, metavar="N", help="stop after N steps (default: play all tasks)")
+    group.add_argument("--verbose", type=int, default=1, help="0 prints nothing, 1 (default) a line for each episode")
+
+
 def chosen_agent(parser: argparse.ArgumentParser, args: argparse.Namespace, path: Path | None) -> TrainedAgent:
     """
     :param parser: for the message if arguments are missing

@@ -7,11 +7,11 @@ from pathlib import Path
 import imageio_ffmpeg
 
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.zoo.commands.arguments import add_agent_arguments, make_parser, parse
-from sb3_htr.zoo.commands.enjoy import add_task_arguments, can_be_drawn, watch
+from sb3_htr.zoo.commands.arguments import add_agent_arguments, add_task_arguments, make_parser, parse
 from sb3_htr.zoo.show.captions import Captioner
 from sb3_htr.zoo.show.film import MAX_GIF_FPS, SUFFIXES, Film
 from sb3_htr.zoo.show.play import Moment
+from sb3_htr.zoo.show.watch import can_be_drawn, watch
 
 EXAMPLE = """  sb3-htr record --env SparsePointRobot-v0                       SparsePointRobot-v0.mp4
   sb3-htr record runs -o adaptation.gif --task 2 --n-episodes 6

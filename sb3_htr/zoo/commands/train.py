@@ -11,7 +11,7 @@ import gymnasium as gym
 
 from htr_envs.goal_env import NAMESPACE, find_hidden
 from sb3_htr.common.checkpoint import n_steps_done
-from sb3_htr.zoo.run.agents import find_run, is_finished, n_steps_of
+from sb3_htr.zoo.run.agents import find_runs, is_finished, n_steps_of
 from sb3_htr.zoo.run.malloc import keep_freed_memory
 from sb3_htr.zoo.run.method import DEFAULT, get_method, methods
 from sb3_htr.zoo.run.record import OF_TRAINING, RECORD, command_to_go_on, read_record
@@ -79,7 +79,7 @@ def main(argv: Sequence[str]) -> None:
         if rest or args.method:
             more_than_run = " ".join(rest) or "--method"
             raise ValueError(f"train --resume goes on with the run's own arguments: leave {more_than_run} out.")
-        run = find_run(args.resume)
+        run = find_runs(args.resume)[-1]
         record = read_record(run / RECORD)
         if not {*OF_TRAINING} <= record.keys():
             raise ValueError(f"{run} is no run of sb3-htr train, so there is nothing to go on with: give the folder of one.")

@@ -188,15 +188,6 @@ def find_runs(folder: Path) -> list[Path]:
     return [run.parent for run in runs]
 
 
-def find_run(folder: Path) -> Path:
-    """
-    :param folder: a run folder, or a folder with runs somewhere in it
-    :return: the run folder, the newest one
-    :raises FileNotFoundError: if there is none
-    """
-    return find_runs(folder)[-1]
-
-
 def runs_with_models(folder: Path) -> list[Path]:
     """
     :param folder: a run folder, or a folder with runs somewhere in it

@@ -8,6 +8,7 @@ import yaml
 from huggingface_hub import EvalResult, ModelCardData
 
 from sb3_htr.adaptation.evaluation import AdaptationRecord
+from sb3_htr.common.markdown import markdown_table
 from sb3_htr.zoo.run.algorithm import Algorithm
 from sb3_htr.zoo.run.hub import model_name
 from sb3_htr.zoo.run.method import DEFAULT, PEARLMethod, get_method, methods
@@ -64,14 +65,14 @@ def table(scores: dict[str, AdaptationRecord]) -> str:
     """
     n_episodes = next(iter(scores.values())).returns.shape[1]
     head = ["adaptation episode", *(f"{what}, explorer `{name}`" for name in scores for what in ("return", "tasks solved"))]
-    lines = [head, ["---"] * len(head)]
+    lines: list[list[str]] = []
     for i in sorted({episode for episode in SHOWN if episode < n_episodes} | {n_episodes}):
         cells = [str(i)]
         for record in scores.values():
             returns = record.returns[:, i - 1]
             cells += [f"{returns.mean():.2f} ± {returns.std():.2f}", f"{record.successes[:, i - 1].mean():.0%}"]
         lines.append(cells)
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+    return markdown_table(head, lines)
 
 
 def snippet(algorithm: Algorithm, path: str, env: str, n_episodes: int) -> str:

@@ -59,7 +59,7 @@ class Camera(gym.Wrapper):
     def __init__(self, env: gym.Env, every: int) -> None:
         super().__init__(env)
         self.every = every
-        # Since they were taken away: those of a step that ends an episode, and of the reset that follows, are two
+        # Those that next_frame has not returned yet: a step that ends an episode adds two, its own and that of the reset
         self.frames: list[np.ndarray | None] = []
         self._n_steps = 0
 
