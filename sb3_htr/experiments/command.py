@@ -55,7 +55,7 @@ def main(argv: Sequence[str]) -> None:
     storage.send_results(chosen)
     failed: ValueError | None = None
     if not args.finished:
-        on_this_machine = executors.Here() if args.cell is not None else executors.Processes(args.jobs)
+        on_this_machine = executors.SerialExecutor() if args.cell is not None else executors.Processes(args.jobs)
         try:
             driver.Driver(chosen, runs, executors.Ray(args.ray, args.device) if args.ray else on_this_machine).run()
         except KeyboardInterrupt:

@@ -30,8 +30,10 @@ def digest_of_code(modules: Iterable[str]) -> str:
     return sha256(*files)
 
 
-class Kept:
+class EvaluationCache:
     """
+    Evaluations of one model, in files of its run's folder.
+
     :param run: folder of the run
     :param model: file of its final model
     :param about: what else the evaluations depend on

@@ -14,7 +14,7 @@ T = TypeVar("T")
 GPU_SHARE = 0.2
 
 
-class Here(Executor):
+class SerialExecutor(Executor):
     """Each call at once, in this process: for one cell, where something else sees to processes, as Slurm does."""
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:

@@ -17,7 +17,7 @@ from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checkpoint import checkpoints
 from sb3_htr.common.versions import UNKNOWN_HARDWARE, commit, hardware, named, versions
 from sb3_htr.experiments.cell import Cell
-from sb3_htr.experiments.evaluation_cache import FOLDER, Kept, digest_of_code
+from sb3_htr.experiments.evaluation_cache import FOLDER, EvaluationCache, digest_of_code
 from sb3_htr.experiments.log import logged
 from sb3_htr.experiments.protocol import check_evaluations, evaluate
 from sb3_htr.zoo.commands import train
@@ -123,7 +123,7 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
     progress = np.genfromtxt(run / "progress.csv", delimiter=",", names=True, deletechars="")
     columns = progress.dtype.names or ()
     record = read_record(run / RECORD)
-    kept = Kept(run, agent_at(run, "last").path, cell.facts(), code)
+    kept = EvaluationCache(run, agent_at(run, "last").path, cell.facts(), code)
     return {
         **{key: np.nanmean(progress[f"train/{key}"]) if f"train/{key}" in columns else np.nan for key in LOGGED},
         "timesteps": evaluations["timesteps"],

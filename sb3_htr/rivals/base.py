@@ -54,7 +54,7 @@ RANGES: dict[str, tuple[float] | tuple[float, float]] = {
 }
 
 
-class FreshStart(BaseCallback):
+class ResetCallback(BaseCallback):
     """Resets all envs where a rollout begins, after other callbacks had a look: so that nothing of an env need be saved."""
 
     model: "Rival"
@@ -66,7 +66,7 @@ class FreshStart(BaseCallback):
         return True
 
 
-class FiniteSteps(BaseCallback):
+class FiniteStepsCallback(BaseCallback):
     """Ends a training where the env returns NaN or infinity, of which the libraries learn until all networks are NaN."""
 
     def _on_step(self) -> bool:
@@ -270,7 +270,7 @@ class Rival(CheckedFiles, Resumable):
         return [*super()._excluded_save_params(), "_log_interval"]
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        result = followed_by(callback, CallbackList([FiniteSteps(), FreshStart()]))
+        result = followed_by(callback, CallbackList([FiniteStepsCallback(), ResetCallback()]))
         for part in parts_of(result):
             if not isinstance(part, EvalCallback) or isinstance(part, MetaEvalCallback):
                 continue

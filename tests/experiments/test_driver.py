@@ -18,7 +18,7 @@ import pytest
 from sb3_htr.experiments import driver as driver_module
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.driver import ATTEMPTS, Driver
-from sb3_htr.experiments.executors import Here, Processes
+from sb3_htr.experiments.executors import Processes, SerialExecutor
 from sb3_htr.experiments.grid import EXPERIMENTS, Experiment, Variant
 from sb3_htr.experiments.runner import lock_of, run_cell
 from sb3_htr.experiments.storage.folder import SharedFolder
@@ -66,7 +66,7 @@ def test_several_drivers_share_the_cells_and_none_runs_twice(
         thread.join()
     assert sorted(trained) == sorted(cell.name for cell in CELLS) and len(set(trained)) == 6
     assert all(cell.result(tmp_path).exists() for cell in CELLS)
-    Driver(CELLS, tmp_path, Here()).run()
+    Driver(CELLS, tmp_path, SerialExecutor()).run()
     assert len(trained) == 6, "what is done is skipped"
 
 
@@ -76,7 +76,7 @@ def test_a_cell_that_runs_elsewhere_is_waited_for(trains: Any, tmp_path: Path) -
     cell.run_folder(tmp_path).mkdir(parents=True)
     with lock_of(cell, tmp_path):
         assert not run_cell(cell, tmp_path)
-        waiting = threading.Thread(target=Driver([cell], tmp_path, Here()).run)
+        waiting = threading.Thread(target=Driver([cell], tmp_path, SerialExecutor()).run)
         waiting.start()
         time.sleep(0.2)
         assert waiting.is_alive() and not trained
@@ -102,7 +102,7 @@ def test_failures_are_tried_again_from_where_they_were_and_reported(
 
     trained = trains(work)
     with pytest.raises(ValueError, match=r"1 of 6 cells failed 3 times .*/htr-ser-seed1: RuntimeError: no luck"):
-        Driver(CELLS, tmp_path, Here()).run()
+        Driver(CELLS, tmp_path, SerialExecutor()).run()
     assert trained.count(hopeless.name) == ATTEMPTS and trained.count(slow.name) == 2 * ATTEMPTS + 1 and len(set(trained)) == 6
     out, err = capsys.readouterr()
     assert "5 of 6 cells done, 0 running, 1 failed" in out
@@ -119,11 +119,11 @@ def test_what_was_given_up_here_and_done_elsewhere_is_no_failure(trains: Any, tm
             raise RuntimeError("no luck")
 
     trained = trains(work)
-    Driver(CELLS, tmp_path, Here()).run()
+    Driver(CELLS, tmp_path, SerialExecutor()).run()
 
 
 def test_progress_counts_cells_and_env_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    driver = Driver(CELLS, tmp_path, Here())
+    driver = Driver(CELLS, tmp_path, SerialExecutor())
     assert driver.line(driver.todo()) == "0 of 6 cells done, 0 running, 0 % of the env steps"
     done, running = CELLS[:2]
     (running.run_folder(tmp_path) / "htr-ec/run_1/checkpoints/500_steps").mkdir(parents=True)
@@ -146,7 +146,7 @@ def test_a_node_that_sees_another_folder_is_found_out(trains: Any, tmp_path: Pat
     with pytest.raises(FileNotFoundError, match=r"no folder .*elsewhere on this node: give --runs that all nodes see"):
         run_cell(CELLS[0], tmp_path / "elsewhere")
 
-    class OtherDisk(Here):
+    class OtherDisk(SerialExecutor):
         def submit(self, fn: Any, cell: Any, runs: Any) -> Any:  # type: ignore[override]
             (tmp_path / "other").mkdir(exist_ok=True)
             return super().submit(fn, cell, tmp_path / "other")

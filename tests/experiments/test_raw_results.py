@@ -45,7 +45,7 @@ def test_a_method_of_ones_own_is_trained_alone_and_reported_beside_what_others_r
         return True
 
     monkeypatch.setattr("sb3_htr.experiments.storage.folder.run_cell", train)
-    monkeypatch.setattr(executors, "Processes", lambda _: executors.Here())
+    monkeypatch.setattr(executors, "Processes", lambda _: executors.SerialExecutor())
     assert main(["experiment", "mine", "--with-results", "published"]) == 0
     assert "6 of 8 runs are in published." in capsys.readouterr().out
     assert trained == ["mine-seed1", "mine-seed2"]

@@ -17,7 +17,7 @@ import torch as th
 from helpers.runs import OF_CELL
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.driver import Driver
-from sb3_htr.experiments.executors import Here, Ray
+from sb3_htr.experiments.executors import Ray, SerialExecutor
 from sb3_htr.experiments.grid import Experiment, Variant, by
 from sb3_htr.experiments.runner import find_finished, run_cell
 from sb3_htr.zoo.run.record import RECORD
@@ -111,7 +111,7 @@ def test_a_worker_and_a_node_that_are_killed_cost_no_cell(cluster: Any, tmp_path
     assert done == ["worker", "node"]
     undisturbed.mkdir()
     for cell in cells:
-        assert Here().submit(run_cell, cell, undisturbed).result()
+        assert SerialExecutor().submit(run_cell, cell, undisturbed).result()
         ours, serial = (find_finished(cell, cell.run_folder(folder)) for folder in (runs, undisturbed))
         assert len(list(cell.run_folder(runs).rglob("SparsePointRobot-v0.zip"))) == 1, "it was finished once"
         assert ours is not None and serial is not None and cell.result(runs).exists()

@@ -24,7 +24,7 @@ from sb3_htr.common.versions import hardware
 from sb3_htr.experiments import grid
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.evaluation_cache import FOLDER, digest_of_code
-from sb3_htr.experiments.executors import Here
+from sb3_htr.experiments.executors import SerialExecutor
 from sb3_htr.experiments.grid import Experiment, Variant, by
 from sb3_htr.experiments.protocol import evaluate
 from sb3_htr.experiments.runner import find_finished, run_cell
@@ -355,7 +355,7 @@ def test_one_command_runs_several_experiments(tmp_path: Path, monkeypatch: pytes
         experiment = Experiment(name, "", ENV_ID, 480, variants, 1, eval_freq=240, evaluations=by(("prior",)))
         monkeypatch.setitem(grid.EXPERIMENTS, name, experiment)
     monkeypatch.setattr("sb3_htr.experiments.storage.folder.run_cell", train)
-    monkeypatch.setattr("sb3_htr.experiments.executors.Processes", lambda _: Here())
+    monkeypatch.setattr("sb3_htr.experiments.executors.Processes", lambda _: SerialExecutor())
     monkeypatch.chdir(tmp_path)
     assert main(["experiment", "near", "far", "--cell", "3"]) == 0
     assert queue == ["far {} seed1"] and not Path("results").exists()
@@ -387,7 +387,7 @@ def test_an_experiment_that_is_whole_is_reported_whatever_others_do(
         experiment = Experiment(name, "", ENV_ID, 480, (Variant("htr-ser"),), n_seeds, evaluations=by(("prior",)))
         monkeypatch.setitem(grid.EXPERIMENTS, name, experiment)
     monkeypatch.setattr("sb3_htr.experiments.storage.folder.run_cell", train)
-    monkeypatch.setattr("sb3_htr.experiments.executors.Processes", lambda _: Here())
+    monkeypatch.setattr("sb3_htr.experiments.executors.Processes", lambda _: SerialExecutor())
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match=r"1 of 3 cells failed 3 times .*no luck"):
         main(["experiment", "broken", "whole"])
@@ -439,7 +439,7 @@ def test_runs_are_on_the_cpu_unless_a_device_is_given(
     only = Experiment("only", "", ENV_ID, 480, (Variant("htr-ser"),), 1, eval_freq=240, evaluations=by(("prior",)))
     monkeypatch.setitem(grid.EXPERIMENTS, "only", only)
     monkeypatch.setattr("sb3_htr.experiments.storage.folder.run_cell", run)
-    monkeypatch.setattr("sb3_htr.experiments.command.executors.Processes", lambda n_jobs: Here())
+    monkeypatch.setattr("sb3_htr.experiments.command.executors.Processes", lambda n_jobs: SerialExecutor())
     monkeypatch.setattr("sb3_htr.experiments.command.check_device", lambda device: None)
     monkeypatch.chdir(tmp_path)
     assert main(["experiment", "only", *arguments]) == 0

@@ -32,7 +32,7 @@ from sb3_htr.experiments import driver as driver_module
 from sb3_htr.experiments import grid
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.driver import Driver
-from sb3_htr.experiments.executors import Here
+from sb3_htr.experiments.executors import SerialExecutor
 from sb3_htr.experiments.grid import Experiment, Variant, by
 from sb3_htr.experiments.runner import find_finished, run_cell
 from sb3_htr.experiments.storage import claim as claim_module
@@ -257,7 +257,7 @@ def test_several_drivers_share_the_cells_and_none_runs_twice(
     store = ObjectStore(url)
     here = store.fetch_results(CELLS)
     assert all(cell.result(here).exists() and not store.is_claimed(cell) for cell in CELLS)
-    Driver(CELLS, url, Here()).run()
+    Driver(CELLS, url, SerialExecutor()).run()
     assert len(trained) == 7, "what is done is skipped"
 
 
@@ -354,7 +354,7 @@ def test_a_killed_node_costs_what_it_had_not_sent(tmp_path: Path, url: str) -> N
     node.wait()
     store.look([cell])
     assert store.is_claimed(cell) and not objects.run_on_copy(cell, url), "it may be at work"
-    Driver([cell], url, Here()).run()
+    Driver([cell], url, SerialExecutor()).run()
     (run,) = (tmp_path / "store" / "one").glob("*/htr-ser/*")
     assert "Going on from" in (run.parents[1] / "log.txt").read_text() and not list(run.rglob("evaluated"))
     (tmp_path / "undisturbed").mkdir()
@@ -408,7 +408,7 @@ def test_evaluations_are_kept_until_the_result_is_there(url: str, trains: Any, m
     monkeypatch.setattr(objects, "SEND", 0.05)
     trained = trains(work)
     failing(monkeypatch, "put_file", 3, f"{CELLS[0].name}.npz")
-    Driver(CELLS[:1], url, Here()).run()
+    Driver(CELLS[:1], url, SerialExecutor()).run()
     assert len(trained) == 2
 
 
@@ -418,7 +418,7 @@ def test_the_command_runs_in_a_store_and_reports_from_it(
     trained = trains(lambda cell, folder: None)
     pair = Experiment("pair", "", ENV_ID, 480, (Variant("htr-ser"),), 2, eval_freq=240, evaluations=by(("prior",)))
     monkeypatch.setitem(grid.EXPERIMENTS, "pair", pair)
-    monkeypatch.setattr("sb3_htr.experiments.executors.Processes", lambda _: Here())
+    monkeypatch.setattr("sb3_htr.experiments.executors.Processes", lambda _: SerialExecutor())
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     with pytest.raises(ValueError, match=f"No run of pair is finished in {url}"):

@@ -8,7 +8,7 @@ from sb3_htr.common.settings import check_flags, check_numbers
 from sb3_htr.common.type_aliases import Trajectory
 from sb3_htr.htr.relabel.base import HindsightDraw, Relabeller
 from sb3_htr.htr.relabel.hindsight_task import HindsightTaskStrategy, solved_at_start
-from sb3_htr.htr.step_memo import StepMemo
+from sb3_htr.htr.step_cache import StepCache
 
 if TYPE_CHECKING:
     from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
@@ -93,7 +93,7 @@ class SingleEpisodeRelabelling(Relabeller):
 
     def bind(self, buffer: "MultiTaskReplayBuffer") -> None:
         super().bind(buffer)
-        self._demerits = StepMemo(self._ask_demerits)
+        self._demerits = StepCache(self._ask_demerits)
 
     def draw(self, tasks: np.ndarray) -> HindsightDraw:
         buffer, strategy, index = self.buffer, self.hindsight_task_strategy, self.buffer.episodes.index()

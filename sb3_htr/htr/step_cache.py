@@ -9,7 +9,7 @@ from sb3_htr.htr.episode_store import EpisodeStore
 UNKNOWN = -1
 
 
-class StepMemo:
+class StepCache:
     """
     What a function says of the steps of a store. A step is asked about when it is first looked at; the answer holds until
     another episode is written in its place.

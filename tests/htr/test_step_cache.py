@@ -5,14 +5,14 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sb3_htr.htr.episode_store import EpisodeStore
-from sb3_htr.htr.step_memo import StepMemo
+from sb3_htr.htr.step_cache import StepCache
 
 
 @example([("add", 0, 1), ("look", 0, 1), ("load", 0, 1), ("look", 0, 1)])  # a smaller store in place of a larger one
 @given(
     st.lists(st.tuples(st.sampled_from(("add", "look", "load", "reset")), st.integers(0, 2), st.integers(1, 4)), max_size=40)
 )
-def test_a_memo_says_what_asking_anew_would_say(done: list[tuple[str, int, int]]) -> None:
+def test_a_cache_says_what_asking_anew_would_say(done: list[tuple[str, int, int]]) -> None:
     """However episodes are overwritten, loaded from a file or forgotten between the looks."""
 
     def make_store() -> EpisodeStore:
@@ -24,7 +24,7 @@ def test_a_memo_says_what_asking_anew_would_say(done: list[tuple[str, int, int]]
 
     store, other = make_store(), make_store()
     asked: list[int] = []
-    memo = StepMemo(ask)
+    cache = StepCache(ask)
     for number, (what, task, length) in enumerate([*done, ("look", 0, 1), ("look", 0, 1)]):
         if what == "add":
             store.add(task, np.full((length, 1), number, dtype=np.float32))
@@ -36,7 +36,7 @@ def test_a_memo_says_what_asking_anew_would_say(done: list[tuple[str, int, int]]
             store = make_store()
         else:
             rows = store.index().rows[:, None]
-            np.testing.assert_array_equal(memo.look_up(store, rows), store.rows[rows, 0] % 128)
+            np.testing.assert_array_equal(cache.look_up(store, rows), store.rows[rows, 0] % 128)
             asked.clear()
-            memo.look_up(store, rows[:, 0])
+            cache.look_up(store, rows[:, 0])
             assert not asked, "nothing is asked twice"
