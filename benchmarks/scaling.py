@@ -105,17 +105,17 @@ def milliseconds(function: Callable[[], Any]) -> float:
 def first_look(model: PEARL) -> float:
     """Of what relabelling asks of a step once, when it is first drawn, in microseconds."""
     assert model.replay_buffer is not None
-    episodes, memo = model.replay_buffer.episodes, model.replay_buffer.relabeller._demerits  # type: ignore[attr-defined]
+    episodes, cache = model.replay_buffer.episodes, model.replay_buffer.relabeller._demerits  # type: ignore[attr-defined]
     parts = np.array_split(episodes.index().rows, len(episodes.index().rows) // 1000)
-    return 1e3 * float(np.median([milliseconds(partial(memo._ask, part)) for part in parts[:3]])) / len(parts[0])
+    return 1e3 * float(np.median([milliseconds(partial(cache._ask, part)) for part in parts[:3]])) / len(parts[0])
 
 
 def draw(model: PEARL) -> float:
     """Of one meta-batch, from steps that were looked at before."""
     assert model.replay_buffer is not None
-    memo, episodes = model.replay_buffer.relabeller._demerits, model.replay_buffer.episodes  # type: ignore[attr-defined]
+    cache, episodes = model.replay_buffer.relabeller._demerits, model.replay_buffer.episodes  # type: ignore[attr-defined]
     for part in np.array_split(episodes.index().rows, len(episodes.index().rows) // 1000):
-        memo.look_up(episodes, part)
+        cache.look_up(episodes, part)
     sizes = {"meta_batch_size": model.meta_batch_size, "context_size": model.context_size}
     return milliseconds(partial(model.replay_buffer.sample, model.batch_size, **sizes))
 

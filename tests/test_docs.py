@@ -4,6 +4,7 @@ import pkgutil
 import re
 import runpy
 import shlex
+import shutil
 import subprocess
 from pathlib import Path
 from types import ModuleType
@@ -80,8 +81,11 @@ def test_the_table_of_agents_is_that_of_the_files() -> None:
 
 def has_history() -> bool:
     """What an archive of the sources, and a checkout of the last commit alone, have not."""
-    asked = subprocess.run(["git", "rev-parse", "--is-shallow-repository"], cwd=ROOT, capture_output=True, text=True)
-    return asked.stdout.strip() == "false"
+    if shutil.which("git") is None:
+        return False
+    command = ["git", "rev-parse", "--is-shallow-repository", "--show-toplevel"]
+    asked = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    return asked.stdout.split() == ["false", str(ROOT.resolve())]
 
 
 @pytest.mark.parametrize("tool", [tables, benchmark_tables, state], ids=lambda tool: tool.__name__)

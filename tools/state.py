@@ -14,6 +14,7 @@ import numpy as np
 import yaml
 from tables import RESULTS, fill
 
+from sb3_htr.common.markdown import markdown_table
 from sb3_htr.experiments.cell import file_name
 from sb3_htr.pearl.horizon import settings_for
 from sb3_htr.zoo.run.method import OWN, PEARLMethod, methods
@@ -174,11 +175,11 @@ def state(results: Path) -> str:
             today.append(run)
     text = f"By today's code: {_labels(today, n_runs) or 'none'}.\n\n"
     text += "".join(f"By today's code but for {names}: {_labels(some, n_runs)}.\n\n" for names, some in but_for.items())
-    lines = [HEADS, ("---",) * len(HEADS)]
+    lines = []
     for (_, *changed), some in sorted(rows.items(), key=lambda row: row[0][0]):
         commits = dict.fromkeys(re.sub(r"\b([0-9a-f]{7})[0-9a-f]+", r"\1", run.commits[0]) for run in some)
         lines.append((_labels(some, n_runs), str(len(some)), ", ".join(commits), *changed))
-    text += "".join("| " + " | ".join(line) + " |\n" for line in lines)
+    text += markdown_table(HEADS, lines) + "\n"
     for name, some in not_older.items():
         text += f"\nAll in the table are older than *{name}*, too{', but for ' * bool(some)}{_labels(some, n_runs)}.\n"
     return text

@@ -28,7 +28,7 @@ from sb3_htr.zoo.run.method import get_method, merged
 from sb3_htr.zoo.run.record import RECORD, read_record
 from sb3_htr.zoo.run.time_to_learned import seconds_at
 from sb3_htr.zoo.run.train_arguments import training_facts
-from sb3_htr.zoo.run.trust import import_packages
+from sb3_htr.zoo.run.trust import import_packages, plain_settings
 
 # Means over the training of what HTR paper, B.2 reasons with
 LOGGED = ("relabelled_fraction", "rl_reward_mean", "rl_zero_reward_fraction")
@@ -184,6 +184,10 @@ def _planned(cell: Cell) -> dict[str, Any]:
 def _check_loadable(cell: Cell) -> None:
     """Before it is trained: its model will be loaded as those of strangers are."""
     try:
-        get_method(cell.method).algorithm.check_loadable(hyperparams_of(cell))
+        hyperparams = plain_settings(hyperparams_of(cell), cell.label, trust=False)
+    except ValueError:  # code, as rl_zoo3 takes it: what it makes is known when it has been run
+        return
+    try:
+        get_method(cell.method).algorithm.check_loadable(hyperparams)
     except ValueError as error:
         raise ValueError(f"{cell.label} could not be evaluated: {error.args[0].rstrip('.')}. Leave it out.") from None

@@ -77,9 +77,7 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
         replay = data.get("replay_buffer_kwargs")
         replay = replay if isinstance(replay, dict) else {}
         settings["replay_buffer_kwargs"] = {name: replay[name] for name in REPLAY if name in replay and PICKLED not in replay}
-        for name, most in (("context_size", MAX_CONTEXT), ("buffer_size", MAX_BUFFER)):
-            if settings.get(name, 0) > most:
-                raise Refused(f"PEARL has no {name} of {settings[name]} here: expected {most} at most.")
+        _check_memory(settings)
         counters = {name: data[name] for name in COUNTERS if type(data.get(name)) is int}
         settings["policy_kwargs"] = _policy_kwargs(data.get("policy_kwargs", {}))
     except (*OPEN_ERRORS, Warning):
@@ -110,10 +108,12 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
 
 def check_loadable(hyperparams: dict[str, Any]) -> None:
     """
-    :param hyperparams: of a training to come
-    :raises Refused: if a file of its model would be
+    :param hyperparams: of a training to come, which looks itself at what PEARL does not know or take
+    :raises Refused: for what PEARL takes, and no file of its model may have
     """
-    _policy_kwargs(hyperparams.get("policy_kwargs") or {})
+    given = hyperparams.get("policy_kwargs") or {}
+    _check_networks({name: value for name, value in given.items() if name in keywords_of(PEARLPolicy)})
+    _check_memory(hyperparams)
     for name in EXPLORERS:
         if name in hyperparams:
             check_is_ours(name, type(explorers.to_explorer(hyperparams[name])).__module__)
@@ -154,7 +154,14 @@ def _schedule(learning_rate: Any) -> dict[str, LinearSchedule]:
     return {"learning_rate": LinearSchedule(*numbers)}
 
 
-def _policy_kwargs(given: dict[str, Any]) -> dict[str, Any]:
+def _check_memory(settings: dict[str, Any]) -> None:
+    for name, most in (("context_size", MAX_CONTEXT), ("buffer_size", MAX_BUFFER)):
+        if (settings.get(name) or 0) > most:
+            raise Refused(f"PEARL has no {name} of {settings[name]} here: expected {most} at most.")
+
+
+def _check_networks(given: dict[str, Any]) -> set[str]:
+    """Which settings a file may have."""
     known = {"latent_dim", "net_arch", "encoder_arch", "n_critics", "normalize_observations"}
     if given.get("encoder_class") in list(ENCODERS):
         known.add("encoder_class")
@@ -165,6 +172,11 @@ def _policy_kwargs(given: dict[str, Any]) -> dict[str, Any]:
             f"its policy has the setting {unknown[0]!r}, which only PEARL.load restores (on the command line, --trust), and "
             "that may run code of the file."
         )
+    return known
+
+
+def _policy_kwargs(given: dict[str, Any]) -> dict[str, Any]:
+    known = _check_networks(given)
     kwargs = {name: value for name, value in given.items() if name in known and value is not None}
     n_critics = kwargs.get("n_critics", 2)
     if type(n_critics) is not int or not 1 <= n_critics <= MAX_LAYERS:

@@ -74,9 +74,9 @@ def plain_policy(model_class: type[Rival], hyperparams: dict[str, Any]) -> dict[
     for name, value in plain.items():
         parts = value.values() if isinstance(value, dict) else [value]
         if name not in sizes or not all(_is_plain(part, sizes[name]) for part in parts):
+            hint = f", unless POLICY_SIZES of {model_class.__name__} names it" if name not in sizes else ""
             raise ValueError(
-                f"its policy has {name}: {value}, beyond POLICY_SIZES of {model_class.__name__}, which only --trust restores, "
-                "and that may run code of the file"
+                f"its policy has {name}: {value}, which only --trust restores{hint}, and that may run code of the file"
             )
     return plain
 

@@ -297,9 +297,26 @@ def test_settings_that_could_not_be_evaluated_are_not_trained_with(tmp_path: Pat
         ValueError, match=r"could not be evaluated: its train_explorer is a class of its own, .* the file\. Leave"
     ):
         run_cell(cell, tmp_path)
-    no_plain_data = {"policy_kwargs": {"activation_fn": nn.Tanh}}
-    (cell,) = Experiment("one", "", ENV_ID, 480, (Variant("htr-ser", "", no_plain_data),), 1).cells()
-    with pytest.raises(ValueError, match=r"could not be evaluated: its policy has the setting 'activation_fn'"):
+    for settings, message in (
+        ({"policy_kwargs": {"activation_fn": nn.Tanh}}, "its policy has the setting 'activation_fn'"),
+        ({"buffer_size": 10**8}, "PEARL has no buffer_size of 100000000 here"),
+    ):
+        (cell,) = Experiment("one", "", ENV_ID, 480, (Variant("htr-ser", "", settings),), 1).cells()
+        with pytest.raises(ValueError, match=f"could not be evaluated: {message}"):
+            run_cell(cell, tmp_path)
+
+
+@pytest.mark.parametrize("networks", ["{'latent_dim': 3}", "dict(latent_dim=3)", {"latent_dim": 0}, {"latentdim": 3}])
+def test_what_is_for_the_training_to_say_is_left_to_it(networks: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Begun(Exception):
+        pass
+
+    def begin(_: Any) -> None:
+        raise Begun
+
+    monkeypatch.setattr("sb3_htr.experiments.runner.train.main", begin)
+    (cell,) = Experiment("one", "", ENV_ID, 480, (Variant("htr-ser", "", {"policy_kwargs": networks}),), 1).cells()
+    with pytest.raises(Begun):
         run_cell(cell, tmp_path)
 
 
