@@ -325,10 +325,10 @@ class MetaExperimentManager(ExperimentManager):
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
         if self.trust:
             return super()._load_pretrained_agent(hyperparams, env)
+        print("Loading pretrained agent")
         given = {key: value for key, value in hyperparams.items() if key not in ("policy", "policy_kwargs")}
         logged = {"seed": self.seed, "tensorboard_log": self.tensorboard_log, "verbose": self.verbose}
         model = self.method.algorithm.load_to_train(self.trained_agent, env, self.device, **given, **logged)
-        print(f"Training on {self.trained_agent}")
         replay_buffer = Path(self.trained_agent).with_name("replay_buffer.pkl")
         if replay_buffer.exists():
             print("Loading replay buffer")
