@@ -112,7 +112,7 @@ def check_loadable(hyperparams: dict[str, Any]) -> None:
     :raises Refused: for what PEARL takes, and no file of its model may have
     """
     given = hyperparams.get("policy_kwargs") or {}
-    _check_networks({name: value for name, value in given.items() if name in keywords_of(PEARLPolicy)})
+    _check_policy_settings({name: value for name, value in given.items() if name in keywords_of(PEARLPolicy)})
     _check_memory(hyperparams)
     for name in EXPLORERS:
         if name in hyperparams:
@@ -156,12 +156,16 @@ def _schedule(learning_rate: Any) -> dict[str, LinearSchedule]:
 
 def _check_memory(settings: dict[str, Any]) -> None:
     for name, most in (("context_size", MAX_CONTEXT), ("buffer_size", MAX_BUFFER)):
-        if (settings.get(name) or 0) > most:
+        if type(settings.get(name)) in (int, float) and settings[name] > most:
             raise Refused(f"PEARL has no {name} of {settings[name]} here: expected {most} at most.")
 
 
-def _check_networks(given: dict[str, Any]) -> set[str]:
-    """Which settings a file may have."""
+def _check_policy_settings(given: dict[str, Any]) -> set[str]:
+    """
+    :param given: settings of a policy
+    :return: names of those that a file may have
+    :raises Refused: if there are others
+    """
     known = {"latent_dim", "net_arch", "encoder_arch", "n_critics", "normalize_observations"}
     if given.get("encoder_class") in list(ENCODERS):
         known.add("encoder_class")
@@ -176,7 +180,7 @@ def _check_networks(given: dict[str, Any]) -> set[str]:
 
 
 def _policy_kwargs(given: dict[str, Any]) -> dict[str, Any]:
-    known = _check_networks(given)
+    known = _check_policy_settings(given)
     kwargs = {name: value for name, value in given.items() if name in known and value is not None}
     n_critics = kwargs.get("n_critics", 2)
     if type(n_critics) is not int or not 1 <= n_critics <= MAX_LAYERS:

@@ -306,8 +306,17 @@ def test_settings_that_could_not_be_evaluated_are_not_trained_with(tmp_path: Pat
             run_cell(cell, tmp_path)
 
 
-@pytest.mark.parametrize("networks", ["{'latent_dim': 3}", "dict(latent_dim=3)", {"latent_dim": 0}, {"latentdim": 3}])
-def test_what_is_for_the_training_to_say_is_left_to_it(networks: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"policy_kwargs": "{'latent_dim': 3}"},
+        {"policy_kwargs": "dict(latent_dim=3)"},
+        {"policy_kwargs": {"latent_dim": 0}},
+        {"policy_kwargs": {"latentdim": 3}},
+        {"buffer_size": "large"},
+    ],
+)
+def test_what_is_for_the_training_to_say_is_left_to_it(settings: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Begun(Exception):
         pass
 
@@ -315,7 +324,7 @@ def test_what_is_for_the_training_to_say_is_left_to_it(networks: Any, tmp_path: 
         raise Begun
 
     monkeypatch.setattr("sb3_htr.experiments.runner.train.main", begin)
-    (cell,) = Experiment("one", "", ENV_ID, 480, (Variant("htr-ser", "", {"policy_kwargs": networks}),), 1).cells()
+    (cell,) = Experiment("one", "", ENV_ID, 480, (Variant("htr-ser", "", settings),), 1).cells()
     with pytest.raises(Begun):
         run_cell(cell, tmp_path)
 
