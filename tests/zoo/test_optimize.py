@@ -226,6 +226,7 @@ def test_what_is_sampled_makes_a_model_of_the_method_and_is_what_is_loaded(name:
         assert ("hindsight_task_strategy" in trial.params) == (method.name.split("-prior")[0] in ("htr-ser", "htr-ec"))
         assert ("temperature" in trial.params) == (method.name.split("-prior")[0] in ("htr-hfr", "htr-hipi"))
         assert sampled["learning_rate"] == f"lin_{trial.params['learning_rate']}"
+        assert 0 <= sampled["learning_starts"] <= 20_000
         sampled = MetaExperimentManager._preprocess_schedules(sampled)
         model = PEARL("MlpPolicy", ENV_ID, **merged(method.hyperparams(), sampled))
         assert model.policy.latent_dim == trial.params["latent_dim"]

@@ -95,6 +95,7 @@ PEARL = SearchSpace(
     },
     ints={
         "n_steps": (1, 10),
+        "learning_starts": (0, 20_000),  # what learns of training tasks alone waits until chance has met one
         "batch_size_pow": (3, 8),
         "meta_batch_size_pow": (3, 6),
         "gradient_steps_pow": (6, 9),
