@@ -1,10 +1,12 @@
 """What users of Stable-Baselines3 rely on in any algorithm."""
 
 import copy
+import pickle
 import warnings
 from pathlib import Path
 from typing import Any
 
+import cloudpickle  # type: ignore[import-untyped]
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -17,14 +19,16 @@ from stable_baselines3.common.callbacks import (
     StopTrainingOnNoModelImprovement,
 )
 from stable_baselines3.common.logger import configure
+from stable_baselines3.sac.policies import Actor
 
-from helpers import ENV_ID, ROLLOUT, MakePEARL
+from helpers import ENV_ID, ROLLOUT, TINY, MakePEARL
 from helpers import parameters as all_parameters
 from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.adaptation import MetaEvalCallback
 from sb3_htr.common.checkpoint import load_latest
 from sb3_htr.common.checkpoint_callback import CheckpointCallback as Checkpointing
 from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.pearl.policies import PEARLPolicy
 
 
 def test_parameters_can_be_read_and_set(tiny_pearl: MakePEARL) -> None:
@@ -204,7 +208,7 @@ def test_callbacks_see_what_sb3_has_in_a_rollout(tiny_pearl: MakePEARL) -> None:
     seen: list[dict[str, Any]] = []
 
     def look(local: dict[str, Any], _: Any) -> bool:
-        seen.append({name: local[name] for name in ("actions", "buffer_actions", "new_obs", "rewards", "dones", "infos")})
+        seen.append({name: local[name] for name in ("actions", "buffer_actions", "next_obs", "rewards", "dones", "infos")})
         return True
 
     model = tiny_pearl(seed=0).learn(ROLLOUT, look)
@@ -212,7 +216,58 @@ def test_callbacks_see_what_sb3_has_in_a_rollout(tiny_pearl: MakePEARL) -> None:
     assert model.replay_buffer is not None
     np.testing.assert_allclose(model.policy.scale_action(first["actions"]), first["buffer_actions"], atol=1e-6)
     # The point moves by a tenth of its action
-    np.testing.assert_allclose(first["new_obs"], 0.1 * first["actions"], atol=1e-6)
+    np.testing.assert_allclose(first["next_obs"], 0.1 * first["actions"], atol=1e-6)
+
+
+def test_an_actor_of_ones_own_acts_and_learns() -> None:
+    class AlwaysRight(Actor):
+        def get_action_dist_params(self, obs: Any) -> Any:
+            mean, log_std, kwargs = super().get_action_dist_params(obs)
+            return 0 * mean + 3, 0 * log_std - 5, kwargs
+
+    class Policy(PEARLPolicy):
+        def make_actor(self, features_extractor: Any = None) -> Actor:
+            return AlwaysRight(**self._update_features_extractor(self.actor_kwargs, features_extractor))
+
+    seen: list[np.ndarray] = []
+    model = PEARL(Policy, ENV_ID, **TINY).learn(2 * ROLLOUT, lambda local, _: not seen.append(local["actions"]))
+    assert (seen[0] < 0).any() and (seen[-1] > 0.9).all(), "random ones first"
+    assert model._n_updates > 0 and (model.adapt(ENV_ID, 1).predict(np.zeros(2, dtype=np.float32))[0] > 0.9).all()
+
+
+def test_an_actor_whose_own_part_would_not_be_asked_is_refused() -> None:
+    class Sampler(Actor):
+        def action_log_prob(self, obs: Any) -> Any:
+            return super().action_log_prob(obs)
+
+    class Policy(PEARLPolicy):
+        def make_actor(self, features_extractor: Any = None) -> Actor:
+            return Sampler(**self._update_features_extractor(self.actor_kwargs, features_extractor))
+
+    with pytest.raises(ValueError, match=r"The actor Sampler has an action_log_prob of its own, .* get_action_dist_params"):
+        PEARL(Policy, ENV_ID, **TINY)
+
+
+def test_experience_has_a_file_of_its_own(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"replay_buffer is no part of a model's file, .*: call save_replay_buffer"):
+        tiny_pearl().save(tmp_path / "model", include=["replay_buffer"])
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_model_of_an_id_can_be_sent_to_another_process(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl(ENV_ID).learn(ROLLOUT)
+    for loads, dumps in ((pickle.loads, pickle.dumps), (pickle.loads, cloudpickle.dumps)):
+        copied = loads(dumps(model))
+        assert copied.num_timesteps == ROLLOUT
+        copied.learn(ROLLOUT, reset_num_timesteps=False)
+
+
+def test_seeds_of_numpy_are_seeds(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    model.set_random_seed(np.int64(3))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="seed is -1, expected a whole number from 0"):
+        model.set_random_seed(-1)
+    make_task_vec_env(ENV_ID, 2, seed=np.int64(2)).reset()  # type: ignore[arg-type]
 
 
 def test_adam_may_be_told_how_to_work(tiny_pearl: MakePEARL) -> None:

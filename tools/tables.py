@@ -30,6 +30,8 @@ HEADLINES: dict[str, dict[str, tuple[str, ...]]] = {
         "ant_prior": ("htr-ser", "pearl-dense"),
     },
 }
+# Which experiment the table of rivals in README.md is of
+RIVALS = {"headline:rivals": "rivals"}
 # What the first variant of experiments is compared with
 COMPARED: dict[str, dict[str, tuple[str, ...]]] = {
     "differences": {
@@ -70,6 +72,24 @@ def headline(summaries: dict[str, dict[str, Any]], methods_of: dict[str, tuple[s
                 scores.setdefault(key, {})[row["explorer"], row["metric"]] = _interval(row)
         lines += [[*key, *(cells.get(column, "") for column in shown)] for key, cells in scores.items()]
     return markdown_table(["env", "env steps", "runs", "method", *heads], lines) + "\n"
+
+
+def rivals(summary: dict[str, Any]) -> str:
+    """
+    :param summary: content of a ``summary.json``
+    :return: Markdown table, one line per method: tasks solved by its first explorer, in each env that it was tested in, and
+        env steps, as a multiple of those of the first method
+    """
+    explorers: dict[str, str] = {}
+    solved: dict[tuple[str, str], dict[str, str]] = {}
+    for row in summary["rows"]:
+        if row["metric"] == "success_rate" and row["explorer"] == explorers.setdefault(row["variant"], row["explorer"]):
+            solved.setdefault((row["variant"], f"{row['env_steps']:,}"), {})[place(row)] = _interval(row)
+    times = {row["variant"]: _times(row) for row in summary["slowdowns"]}
+    places = list(dict.fromkeys(where for cells in solved.values() for where in cells))
+    heads = [f"tasks solved, {where}" if where else "tasks solved" for where in places]
+    lines = [[*key, *(cells.get(where, "") for where in places), times.get(key[0], "1")] for key, cells in solved.items()]
+    return markdown_table(["method", "env steps", *heads, "env steps until 80 % are solved"], lines) + "\n"
 
 
 def differences(summaries: dict[str, dict[str, Any]], methods_of: dict[str, tuple[str, ...]]) -> str:
@@ -152,6 +172,7 @@ def tables() -> dict[str, str]:
     own = {f"results:{summary['name']}": table(summary) for summary in summaries}
     by_name = {summary["name"]: summary for summary in summaries}
     headlines = {name: headline(by_name, methods_of) for name, methods_of in HEADLINES.items()}
+    headlines |= {name: rivals(by_name[experiment]) for name, experiment in RIVALS.items()}
     return {**own, **headlines, **{name: differences(by_name, methods_of) for name, methods_of in COMPARED.items()}}
 
 

@@ -11,7 +11,7 @@ import torch as th
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_htr.adaptation.evaluation import MetaLearner, first_success, record_adaptation, task_set
+from sb3_htr.adaptation.evaluation import MetaLearner, check_adapts, first_success, record_adaptation, task_set
 from sb3_htr.adaptation.explorers import to_explorer
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checks import get_task_family
@@ -87,6 +87,7 @@ class MetaEvalCallback(EvalCallback):
                 "eval_env is the env that is trained on, whose episodes an evaluation would break off: pass another."
             )
         # The first evaluation may be at the end of the training
+        check_adapts(self.model)
         model = cast(MetaLearner, self.model)
         model.check_env(self.eval_env)
         model.start_adaptation(1, self.explorer, th.Generator())

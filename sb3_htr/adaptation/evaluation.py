@@ -45,6 +45,18 @@ class MetaLearner(Protocol):
         ...
 
 
+def check_adapts(model: Any) -> None:
+    """
+    :param model: of any kind
+    :raises ValueError: if it is no :class:`MetaLearner`
+    """
+    if not hasattr(model, "start_adaptation"):
+        raise ValueError(
+            f"{type(model).__name__} does not adapt: pass the model of meta-training, or evaluate an adapted agent by "
+            "stable_baselines3's evaluate_policy."
+        )
+
+
 class AdaptationRecord(NamedTuple):
     """
     What happened in the adaptation episodes of some tasks.
@@ -169,11 +181,7 @@ def record_adaptation(
         envs than tasks
     :return: returns, successes and achieved tasks
     """
-    if not hasattr(model, "start_adaptation"):
-        raise ValueError(
-            f"{type(model).__name__} does not adapt: pass the model of meta-training, or evaluate an adapted agent by "
-            "stable_baselines3's evaluate_policy."
-        )
+    check_adapts(model)
     check_numbers(seed=(seed, 0, MAX_SEED))
     tasks = "test" if tasks is None else tasks
     if isinstance(env, str):

@@ -43,15 +43,16 @@ def check_numbers(**numbers: tuple[Any, float] | tuple[Any, float, float]) -> No
         which may be infinite; with an int as the smallest one, it must be a whole number
     :raises ValueError: for the first one that is none, or out of its range
     """
-    for name, (value, low, *largest) in numbers.items():
+    for name, (given, low, *largest) in numbers.items():
+        value = plain(given)  # compared in its own type, a float32 would make infinity of the limits
         high = largest[0] if largest else sys.float_info.max
         whole = isinstance(low, int)
-        kind = int | np.integer if whole else int | float | np.number
+        kind = int if whole else int | float
         # written so that nan, which compares with nothing, is refused too
         if isinstance(value, bool) or not (isinstance(value, kind) and low <= value <= high):
             article = "a whole number" if whole else "a number"
             limits = f" of at least {low:g}" if high >= sys.float_info.max else f" from {low:g} to {high:g}"
-            raise ValueError(f"{name} is {value!r}, expected {article}{'' if low == LOWEST else limits}.")
+            raise ValueError(f"{name} is {given!r}, expected {article}{'' if low == LOWEST else limits}.")
 
 
 def plain(value: Any) -> Any:

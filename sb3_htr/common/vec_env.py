@@ -162,6 +162,8 @@ def make_task_vec_env(
     :raises gymnasium.error.NameNotFound: for an id that is not registered
     """
     check_numbers(n_envs=(n_envs, 1))
+    if not isinstance(env_id, str):
+        raise ValueError(f"env_id is {env_id!r}, expected the id of a registered env, which is made n_envs times.")
     module, _, env_id = env_id.rpartition(":")
     if module:
         importlib.import_module(module)

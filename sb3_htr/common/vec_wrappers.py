@@ -2,6 +2,7 @@
 
 import contextlib
 import copy
+import inspect
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -13,6 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_htr.common.errors import reason
+from sb3_htr.common.random_state import checked_seed
 
 
 class PatientResultsWriter(ResultsWriter):
@@ -30,13 +32,22 @@ class PatientResultsWriter(ResultsWriter):
 
 
 class CopiedWrapper(VecEnvWrapper):
-    """A wrapper that can be deep-copied; SB3's cannot, because they pass on to the env within what ``copy`` asks of them."""
+    """
+    A wrapper that can be deep-copied and pickled; SB3's cannot, because they pass on to the env within what ``copy`` asks of
+    them, and keep what no pickle takes.
+    """
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Two monitors would write into one file
+        left_out = ("class_attributes", "results_writer")
+        return {name: None if name in left_out else value for name, value in vars(self).items()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, class_attributes=dict(inspect.getmembers(type(self))))
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "CopiedWrapper":
         result = memo[id(self)] = type(self).__new__(type(self))
-        # Two monitors would write into one file
-        shared = {"class_attributes": self.class_attributes, "results_writer": None}
-        vars(result).update({key: shared[key] if key in shared else copy.deepcopy(x, memo) for key, x in vars(self).items()})
+        result.__setstate__(copy.deepcopy(self.__getstate__(), memo))
         return result
 
 
@@ -102,7 +113,9 @@ def seed_envs(env: VecEnv, seed: int | None) -> Sequence[int | None]:
     :param env: VecEnv
     :param seed: of the first env
     :return: seeds of all
+    :raises ValueError: if some generator does not take it
     """
+    seed = checked_seed(seed)
     seeds = env.seed(seed)
     env.unwrapped._seeds = [seeds[0], *np.random.SeedSequence(seeds[0]).generate_state(env.num_envs)[1:].tolist()]
     return env.unwrapped._seeds

@@ -5,7 +5,7 @@ import pathlib
 import pickle
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import IO, Any, TypeVar, cast
 
@@ -306,7 +306,9 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
     def set_random_seed(self, seed: int | None = None) -> None:
         """
         :param seed: seed of python, numpy, torch, envs, rollout tasks, replay buffer and task bank
+        :raises ValueError: if some generator does not take it
         """
+        seed = checked_seed(seed)
         super().set_random_seed(seed)
         if self.env is not None and seed is not None:
             seed_envs(self.env, seed)
@@ -453,8 +455,8 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         act = partial(self._explore, adaptation, learning_starts)
         steps = adaptation_steps(env, adaptation, self.n_episodes_per_task, self.policy.unscale_action, act, obs)
         while (step := self._next_step(steps, tasks)) is not None:
-            # SB3's names, for callbacks
-            rewards, dones, infos, new_obs = step.rewards, step.dones, step.infos, step.next_observations
+            # SB3's names, for callbacks: of an ended episode, its last observation
+            rewards, dones, infos, next_obs = step.rewards, step.dones, step.infos, step.next_observations
             buffer_actions, actions = step.actions, self.policy.unscale_action(step.actions)
             self.num_timesteps += env.num_envs
             # Give access to local variables
@@ -462,7 +464,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
             if not callback.on_step():
                 return False
             self._update_info_buffer(infos, dones)
-            replay_buffer.add(step.observations, new_obs, step.actions, rewards, dones, infos)
+            replay_buffer.add(step.observations, next_obs, step.actions, rewards, dones, infos)
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
             self._episode_num += int(dones.sum())
         return True
@@ -641,6 +643,23 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()
         return [*state_dicts, "knowledge"], variables
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """
+        :param path: file, ``.zip`` is added to a name without suffix; it is replaced at the end or not at all
+        :param exclude: attributes to leave out
+        :param include: attributes to save that would be left out
+        :raises ValueError: for the replay buffer, which is not read from there
+        """
+        include = [*(include or ())]
+        if "replay_buffer" in include:
+            raise ValueError("replay_buffer is no part of a model's file, and would not be loaded: call save_replay_buffer.")
+        super().save(path, exclude, include)
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """

@@ -146,6 +146,7 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
+        self._check_actor()
         self.normalizer = ObservationNormalizer(self.obs_dim) if self.normalize_observations else None
         context_dim = self.obs_dim + self.action_dim + 1
         self.encoder = self.encoder_class(context_dim, self.latent_dim, self.encoder_arch, self.activation_fn)
@@ -162,6 +163,15 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
         actor = super().make_actor(features_extractor)
         with_fast_layers(actor)
         return actor
+
+    def _check_actor(self) -> None:
+        """What a subclass makes is asked for its distributions alone."""
+        for name in ("forward", "_predict", "action_log_prob"):
+            if getattr(type(self.actor), name) is not getattr(Actor, name):
+                raise ValueError(
+                    f"The actor {type(self.actor).__name__} has an {name} of its own, which nothing calls: override its "
+                    "get_action_dist_params."
+                )
 
     def make_critic(self, features_extractor: nn.Module | None = None) -> LatentCritic:  # type: ignore[override]
         kwargs: dict[str, Any] = self.critic_kwargs
@@ -188,7 +198,8 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
 
     def act(self, obs: np.ndarray, z: np.ndarray, deterministic: bool = False) -> np.ndarray:
         """
-        What :meth:`predict` does, without its checks and conversions, which take longer: for every step of an adaptation.
+        What :meth:`predict` does, without its checks and conversions, which take longer: for every step of a rollout and of an
+        adaptation, so that a ``predict`` of a subclass has no say in them.
 
         :param obs: (n, obs_dim)
         :param z: (n, latent_dim) float32
@@ -259,6 +270,10 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
 
     def _gaussian(self, obs_z: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Mean and log standard deviation of the actions before tanh."""
+        if type(self.actor) is not Actor:
+            mean, log_std, _ = self.actor.get_action_dist_params(obs_z)
+            return mean, log_std
+        # The same, without SB3's preprocessing, which takes longer than the products
         hidden = self.actor.latent_pi(obs_z)
         log_std = self.actor.log_std(hidden).clamp(LOG_STD_MIN, LOG_STD_MAX)  # type: ignore[operator]
         return self.actor.mu(hidden), log_std

@@ -76,7 +76,13 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
         settings |= _schedule(data.get("learning_rate"))
         replay = data.get("replay_buffer_kwargs")
         replay = replay if isinstance(replay, dict) else {}
-        settings["replay_buffer_kwargs"] = {name: replay[name] for name in REPLAY if name in replay and PICKLED not in replay}
+        if PICKLED in replay:
+            warnings.warn(
+                f"replay_buffer_kwargs are in {path} as no plain data, and are left at their default: to train on, give them.",
+                stacklevel=2,
+            )
+            replay = {}
+        settings["replay_buffer_kwargs"] = {name: replay[name] for name in REPLAY if name in replay}
         _check_memory(settings)
         counters = {name: data[name] for name in COUNTERS if type(data.get(name)) is int}
         settings["policy_kwargs"] = _policy_kwargs(data.get("policy_kwargs", {}))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper
 
@@ -30,6 +31,11 @@ def test_robots_without_end_are_given_up_whatever_was_loaded_with_the_model(tiny
     tiny_pearl().save(tmp_path / "model")
     with pytest.raises(ValueError, match="An episode goes on after 200 steps, 10 times what those of training had"):
         PEARL.load(tmp_path / "model").adapt(Robot(10**9), n_episodes=1)
+
+
+def test_a_model_that_does_not_adapt_is_refused_by_the_callback_as_by_the_function() -> None:
+    with pytest.raises(ValueError, match="SAC does not adapt: pass the model of meta-training"):
+        SAC("MlpPolicy", ENV_ID).learn(8, MetaEvalCallback(ENV_ID))
 
 
 def test_an_episode_without_end_is_noticed(tiny_pearl: MakePEARL) -> None:

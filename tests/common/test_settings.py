@@ -3,11 +3,12 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
 import pytest
 
 from sb3_htr.adaptation import Aggregate, Belief, Explorer, Prior
 from sb3_htr.adaptation.explorers import EXPLORERS, to_explorer
-from sb3_htr.common.settings import make
+from sb3_htr.common.settings import check_numbers, make
 from sb3_htr.htr import Relabeller
 from sb3_htr.htr.relabel import RELABELLERS
 
@@ -52,3 +53,10 @@ def test_anything_else_is_answered_with_what_there_is(what: str, kinds: Kinds, b
 def test_a_setting_that_cannot_be_is_named(kinds: Kinds, base: Any, settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make("it", settings, kinds, base)
+
+
+def test_numbers_of_numpy_are_compared_as_numbers() -> None:
+    check_numbers(rate=(np.float32(1e-3), 0.0), steps=(np.int32(3), 1))
+    for value in (np.float32(np.nan), np.float32(-1), np.bool_(True), np.complex64(1)):
+        with pytest.raises(ValueError, match=r"rate is .*, expected a number of at least 0"):
+            check_numbers(rate=(value, 0.0))

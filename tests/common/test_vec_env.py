@@ -24,6 +24,12 @@ def test_an_id_can_name_the_module_that_registers_it(tmp_path: Path, monkeypatch
     assert make_task_vec_env("of_mine:OfMine-v0").num_envs == 1
 
 
+def test_an_env_in_place_of_its_id_is_refused() -> None:
+    for given in (gym.make(ENV_ID), lambda: gym.make(ENV_ID)):
+        with pytest.raises(ValueError, match=r"env_id is .*, expected the id of a registered env"):
+            make_task_vec_env(given)  # type: ignore[arg-type]
+
+
 def test_options_of_a_batch_must_agree() -> None:
     env = make_task_vec_env(ENV_ID, 2)
     env.set_options([{"task_id": 1}, {}])

@@ -389,6 +389,13 @@ def test_a_number_that_is_pickled_is_missed(tiny_pearl: MakePEARL, tmp_path: Pat
         load_untrusted(tmp_path / "model", ENV_ID)
 
 
+def test_a_relabeller_that_is_an_object_is_missed(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    settings = {"relabeller": EpisodeClustering(cell_size=0.2), "relabel_probability": 0.3}
+    tiny_pearl(replay_buffer_kwargs=settings).save(tmp_path / "model")
+    with pytest.warns(UserWarning, match="replay_buffer_kwargs are in .* as no plain data, and are left at their default"):
+        load_untrusted(tmp_path / "model", ENV_ID)
+
+
 def test_layers_of_actor_and_critics_may_differ(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
     model = tiny_pearl(policy_kwargs=with_policy(net_arch={"pi": [8], "qf": [9, 10]})).learn(2 * ROLLOUT)
     model.save(tmp_path / "model")
