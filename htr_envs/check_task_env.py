@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory
 
@@ -327,7 +327,7 @@ def _check_episode(env: gym.Env[Any, Any], family: TaskFamily, seed: int) -> Non
     tasks = own_tasks[[0, len(own_tasks) // 2, -1]]
     _check_reward_types(family, traj, tasks[0])
 
-    def dense_reward(steps: Trajectory, task: ArrayLike) -> FloatArray:
+    def dense_reward(steps: Trajectory, task: NDArray[Any]) -> FloatArray:
         return family.compute_reward(steps, task, "dense")
 
     _check_vectorized("compute_reward", family.compute_reward, traj, tasks)

@@ -91,7 +91,7 @@ class TaskFamily(TaskDistribution):
     """
 
     @abstractmethod
-    def compute_reward(self, traj: Trajectory, task: ArrayLike, reward_type: str = "sparse") -> FloatArray:
+    def compute_reward(self, traj: Trajectory, task: NDArray[Any], reward_type: str = "sparse") -> FloatArray:
         """Reward of every step under a task, the task-free part included.
 
         :param traj: the steps, arrays of shape (..., T, dim).
@@ -103,7 +103,7 @@ class TaskFamily(TaskDistribution):
         """
 
     @abstractmethod
-    def is_success(self, traj: Trajectory, task: ArrayLike) -> BoolArray:
+    def is_success(self, traj: Trajectory, task: NDArray[Any]) -> BoolArray:
         """Whether every step solves a task.
 
         :param traj: the steps, arrays of shape (..., T, dim).
@@ -112,7 +112,7 @@ class TaskFamily(TaskDistribution):
         """
 
     @abstractmethod
-    def hindsight_task(self, traj: Trajectory, index: ArrayLike) -> FloatArray:
+    def hindsight_task(self, traj: Trajectory, index: Any) -> FloatArray:
         """The task that the next state of one step solves.
 
         :param traj: the steps, arrays of shape (..., T, dim).
@@ -198,7 +198,8 @@ class TaskEnv(MetaEnv):
 
     def compute_reward(self, traj: Trajectory, task: ArrayLike, reward_type: str | None = None) -> FloatArray:
         """:meth:`TaskFamily.compute_reward`, by default of the env's own reward type."""
-        return self.task_family.compute_reward(traj, task, self.reward_type if reward_type is None else reward_type)
+        tasks, of_env = np.asarray(task, dtype=np.float32), self.reward_type
+        return self.task_family.compute_reward(traj, tasks, of_env if reward_type is None else reward_type)
 
     def hindsight_task(self, traj: Trajectory, index: ArrayLike) -> FloatArray:
         """:meth:`TaskFamily.hindsight_task`."""

@@ -230,7 +230,12 @@ def test_an_actor_of_ones_own_acts_and_learns() -> None:
             return AlwaysRight(**self._update_features_extractor(self.actor_kwargs, features_extractor))
 
     seen: list[np.ndarray] = []
-    model = PEARL(Policy, ENV_ID, **TINY).learn(2 * ROLLOUT, lambda local, _: not seen.append(local["actions"]))
+
+    def look(local: dict[str, Any], _: Any) -> bool:
+        seen.append(local["actions"])
+        return True
+
+    model = PEARL(Policy, ENV_ID, **TINY).learn(2 * ROLLOUT, look)
     assert (seen[0] < 0).any() and (seen[-1] > 0.9).all(), "random ones first"
     assert model._n_updates > 0 and (model.adapt(ENV_ID, 1).predict(np.zeros(2, dtype=np.float32))[0] > 0.9).all()
 
