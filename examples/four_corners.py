@@ -5,7 +5,8 @@
 
 Corners, goal radius and time limit are those of HFR's four corners (Wan et al., 2022), where four goals are all tasks there
 are. Here a goal lies up to 0.1 away from its corner, so that training, validation and test tasks can be different ones. Theirs
-also has a region near each goal that costs more than all else; here nothing is told apart before the goal is reached.
+also has a region between the start and each goal that costs more than all else, and its episodes end at the goal; here nothing
+is told apart before the goal is reached.
 """
 
 from typing import Any, ClassVar
