@@ -167,10 +167,10 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
     def _check_actor(self) -> None:
         """What a subclass makes is asked for its distributions alone."""
         for name in ("forward", "_predict", "action_log_prob"):
-            if getattr(type(self.actor), name) is not getattr(Actor, name):
+            if getattr(type(self.actor), name, None) is not getattr(Actor, name):
                 raise ValueError(
-                    f"The actor {type(self.actor).__name__} has an {name} of its own, which nothing calls: override its "
-                    "get_action_dist_params."
+                    f"The actor {type(self.actor).__name__} overrides {name}, which nothing calls: derive it from SB3's Actor, "
+                    "and override get_action_dist_params."
                 )
 
     def make_critic(self, features_extractor: nn.Module | None = None) -> LatentCritic:  # type: ignore[override]
