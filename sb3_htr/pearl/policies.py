@@ -169,7 +169,7 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
         for name in ("forward", "_predict", "action_log_prob"):
             if getattr(type(self.actor), name, None) is not getattr(Actor, name):
                 raise ValueError(
-                    f"The actor {type(self.actor).__name__} overrides {name}, which nothing calls: derive it from SB3's Actor, "
+                    f"The actor {type(self.actor).__name__} overrides {name}, which nothing calls: derive from SB3's Actor, "
                     "and override get_action_dist_params."
                 )
 
