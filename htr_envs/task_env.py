@@ -203,4 +203,4 @@ class TaskEnv(MetaEnv):
 
     def hindsight_task(self, traj: Trajectory, index: ArrayLike) -> FloatArray:
         """:meth:`TaskFamily.hindsight_task`."""
-        return self.task_family.hindsight_task(traj, index)
+        return self.task_family.hindsight_task(traj, np.asarray(index))

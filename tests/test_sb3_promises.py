@@ -29,6 +29,7 @@ from sb3_htr.common.checkpoint import load_latest
 from sb3_htr.common.checkpoint_callback import CheckpointCallback as Checkpointing
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.pearl.policies import PEARLPolicy
+from sb3_htr.rivals.rl2 import RL2
 
 
 def test_parameters_can_be_read_and_set(tiny_pearl: MakePEARL) -> None:
@@ -208,7 +209,7 @@ def test_callbacks_see_what_sb3_has_in_a_rollout(tiny_pearl: MakePEARL) -> None:
     seen: list[dict[str, Any]] = []
 
     def look(local: dict[str, Any], _: Any) -> bool:
-        seen.append({name: local[name] for name in ("actions", "buffer_actions", "next_obs", "rewards", "dones", "infos")})
+        seen.append({name: local[name] for name in ("actions", "buffer_actions", "new_obs", "rewards", "dones", "infos")})
         return True
 
     model = tiny_pearl(seed=0).learn(ROLLOUT, look)
@@ -216,7 +217,10 @@ def test_callbacks_see_what_sb3_has_in_a_rollout(tiny_pearl: MakePEARL) -> None:
     assert model.replay_buffer is not None
     np.testing.assert_allclose(model.policy.scale_action(first["actions"]), first["buffer_actions"], atol=1e-6)
     # The point moves by a tenth of its action
-    np.testing.assert_allclose(first["next_obs"], 0.1 * first["actions"], atol=1e-6)
+    np.testing.assert_allclose(first["new_obs"], 0.1 * first["actions"], atol=1e-6)
+    ended = [local for local in seen if local["dones"].all()]
+    assert ended and all((local["new_obs"] == 0).all() for local in ended), "each episode begins in the middle"
+    assert all((info["terminal_observation"] != 0).any() for local in ended for info in local["infos"])
 
 
 def test_an_actor_of_ones_own_acts_and_learns() -> None:
@@ -227,7 +231,9 @@ def test_an_actor_of_ones_own_acts_and_learns() -> None:
 
     class Policy(PEARLPolicy):
         def make_actor(self, features_extractor: Any = None) -> Actor:
-            return AlwaysRight(**self._update_features_extractor(self.actor_kwargs, features_extractor))
+            actor = AlwaysRight(**self._update_features_extractor(self.actor_kwargs, features_extractor))
+            actor.mu = th.nn.Sequential(actor.mu, th.nn.Hardtanh())
+            return actor
 
     seen: list[np.ndarray] = []
 
@@ -268,10 +274,10 @@ def test_a_model_of_an_id_can_be_sent_to_another_process(tiny_pearl: MakePEARL) 
 
 
 def test_seeds_of_numpy_are_seeds(tiny_pearl: MakePEARL) -> None:
-    model = tiny_pearl()
-    model.set_random_seed(np.int64(3))  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="seed is -1, expected a whole number from 0"):
-        model.set_random_seed(-1)
+    for model in (tiny_pearl(), RL2("MlpLstmPolicy", ENV_ID)):
+        model.set_random_seed(np.int64(3))  # type: ignore[arg-type]
+        with pytest.raises(ValueError, match="seed is -1, expected a whole number from 0"):
+            model.set_random_seed(-1)
     make_task_vec_env(ENV_ID, 2, seed=np.int64(2)).reset()  # type: ignore[arg-type]
 
 

@@ -78,18 +78,19 @@ def rivals(summary: dict[str, Any]) -> str:
     """
     :param summary: content of a ``summary.json``
     :return: Markdown table, one line per method: tasks solved by its first explorer, in each env that it was tested in, and
-        env steps, as a multiple of those of the first method
+        how many times the env steps of the first method it needs
     """
     explorers: dict[str, str] = {}
     solved: dict[tuple[str, str], dict[str, str]] = {}
     for row in summary["rows"]:
         if row["metric"] == "success_rate" and row["explorer"] == explorers.setdefault(row["variant"], row["explorer"]):
             solved.setdefault((row["variant"], f"{row['env_steps']:,}"), {})[place(row)] = _interval(row)
-    times = {row["variant"]: _times(row) for row in summary["slowdowns"]}
+    first = summary["rows"][0]["variant"]
+    times = {first: "1", **{row["variant"]: _times(row) for row in summary["slowdowns"]}}
     places = list(dict.fromkeys(where for cells in solved.values() for where in cells))
     heads = [f"tasks solved, {where}" if where else "tasks solved" for where in places]
-    lines = [[*key, *(cells.get(where, "") for where in places), times.get(key[0], "1")] for key, cells in solved.items()]
-    return markdown_table(["method", "env steps", *heads, "env steps until 80 % are solved"], lines) + "\n"
+    lines = [[*key, *(cells.get(where, "") for where in places), times.get(key[0], "")] for key, cells in solved.items()]
+    return markdown_table(["method", "env steps", *heads, f"times the env steps of {first}"], lines) + "\n"
 
 
 def differences(summaries: dict[str, dict[str, Any]], methods_of: dict[str, tuple[str, ...]]) -> str:

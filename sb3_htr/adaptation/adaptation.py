@@ -26,6 +26,8 @@ class Step(NamedTuple):
     :param next_observations: (n_envs, obs_dim), the last one of its episode where one ended
     :param dones: (n_envs,) bool, where an episode ended
     :param infos: one dict per env. A loop of one's own needs none: they are for meta-training, and for those who watch
+    :param new_observations: (n_envs, obs_dim), what is acted on next: where an episode ended, the first of the next one. For
+        callbacks of a training
     """
 
     observations: np.ndarray
@@ -34,6 +36,7 @@ class Step(NamedTuple):
     next_observations: np.ndarray
     dones: np.ndarray
     infos: list[dict[str, Any]] = []  # noqa: RUF012 nobody writes to it
+    new_observations: np.ndarray | None = None
 
 
 def check_scaled(actions: np.ndarray) -> None:

@@ -103,7 +103,7 @@ def adaptation_steps(
                 f"An episode goes on after {longest} steps, {ENDLESS} times what those of training had: the env must end its "
                 "episodes, as in a gymnasium.wrappers.TimeLimit."
             )
-        step = Step(obs, actions, rewards, next_obs, dones, infos)
+        step = Step(obs, actions, rewards, next_obs, dones, infos, new_obs)
         adaptation.observe(step)
         yield step
         obs = new_obs

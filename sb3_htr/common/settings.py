@@ -61,7 +61,7 @@ def plain(value: Any) -> Any:
     :return: the same, numbers of numpy in it as Python's: others SB3 writes as pickles, which only those read who trust a file
     """
     if isinstance(value, np.generic):
-        return value.item()
+        return float(value) if isinstance(value, np.floating) else value.item()
     if type(value) is dict:
         return {key: plain(part) for key, part in value.items()}
     return type(value)(map(plain, value)) if type(value) in (list, tuple) else value

@@ -158,7 +158,7 @@ def make_task_vec_env(
     :param wrapper: of each single env
     :param vec_env_class: of single envs; by default they are natively batched if they can be, else in this process
     :return: a monitored VecEnv
-    :raises ValueError: for an env without tasks, or no envs
+    :raises ValueError: for an env without tasks, no envs, or what is no id
     :raises gymnasium.error.NameNotFound: for an id that is not registered
     """
     check_numbers(n_envs=(n_envs, 1))

@@ -455,8 +455,8 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         act = partial(self._explore, adaptation, learning_starts)
         steps = adaptation_steps(env, adaptation, self.n_episodes_per_task, self.policy.unscale_action, act, obs)
         while (step := self._next_step(steps, tasks)) is not None:
-            # SB3's names, for callbacks: of an ended episode, its last observation
-            rewards, dones, infos, next_obs = step.rewards, step.dones, step.infos, step.next_observations
+            # SB3's names, for callbacks
+            rewards, dones, infos, new_obs = step.rewards, step.dones, step.infos, step.new_observations
             buffer_actions, actions = step.actions, self.policy.unscale_action(step.actions)
             self.num_timesteps += env.num_envs
             # Give access to local variables
@@ -464,7 +464,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
             if not callback.on_step():
                 return False
             self._update_info_buffer(infos, dones)
-            replay_buffer.add(step.observations, next_obs, step.actions, rewards, dones, infos)
+            replay_buffer.add(step.observations, step.next_observations, step.actions, rewards, dones, infos)
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
             self._episode_num += int(dones.sum())
         return True

@@ -2,13 +2,13 @@
 
 import math
 from itertools import pairwise
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BaseModel
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, SACPolicy
 from torch import nn
@@ -142,7 +142,7 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
     @property
     def device(self) -> th.device:
         """Where the networks are. SB3 looks for it among all parameters, which takes longer than to act."""
-        return cast(nn.Linear, self.actor.mu).weight.device if hasattr(self, "actor") else th.get_default_device()
+        return next(self.actor.parameters()).device if hasattr(self, "actor") else th.get_default_device()
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
@@ -166,12 +166,15 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
 
     def _check_actor(self) -> None:
         """What a subclass makes is asked for its distributions alone."""
+        if not isinstance(self.actor, Actor):
+            raise ValueError(f"The actor is {type(self.actor).__name__}, expected a class derived from SB3's Actor.")
         for name in ("forward", "_predict", "action_log_prob"):
-            if getattr(type(self.actor), name, None) is not getattr(Actor, name):
+            if getattr(type(self.actor), name) is not getattr(Actor, name):
                 raise ValueError(
-                    f"The actor {type(self.actor).__name__} overrides {name}, which nothing calls: derive from SB3's Actor, "
-                    "and override get_action_dist_params."
+                    f"The actor {type(self.actor).__name__} overrides {name}, which nothing calls: override "
+                    "get_action_dist_params, which is all that it is asked for."
                 )
+        self._actor_is_plain = type(self.actor) is Actor and type(self.actor.features_extractor) is FlattenExtractor
 
     def make_critic(self, features_extractor: nn.Module | None = None) -> LatentCritic:  # type: ignore[override]
         kwargs: dict[str, Any] = self.critic_kwargs
@@ -270,7 +273,7 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
 
     def _gaussian(self, obs_z: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Mean and log standard deviation of the actions before tanh."""
-        if type(self.actor) is not Actor:
+        if not self._actor_is_plain:
             mean, log_std, _ = self.actor.get_action_dist_params(obs_z)
             return mean, log_std
         # The same, without SB3's preprocessing, which takes longer than the products

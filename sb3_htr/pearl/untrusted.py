@@ -77,11 +77,12 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
         replay = data.get("replay_buffer_kwargs")
         replay = replay if isinstance(replay, dict) else {}
         if PICKLED in replay:
-            warnings.warn(
-                f"replay_buffer_kwargs are in {path} as no plain data, and are left at their default: to train on, give them.",
-                stacklevel=2,
-            )
             replay = {}
+            if "replay_buffer_kwargs" not in kwargs:
+                warnings.warn(
+                    f"replay_buffer_kwargs are in {path} as no plain data, and are left at their default: pass them.",
+                    stacklevel=2,
+                )
         settings["replay_buffer_kwargs"] = {name: replay[name] for name in REPLAY if name in replay}
         _check_memory(settings)
         counters = {name: data[name] for name in COUNTERS if type(data.get(name)) is int}

@@ -158,7 +158,9 @@ class Rival(CheckedFiles, Resumable):
     def set_random_seed(self, seed: int | None = None) -> None:
         """
         :param seed: seed of python, numpy, torch and envs
+        :raises ValueError: if some generator does not take it
         """
+        seed = checked_seed(seed)
         super().set_random_seed(seed)
         if self.env is not None and seed is not None:
             seed_envs(self.env, seed)

@@ -12,7 +12,7 @@ from htr_envs import TaskEnv, TaskFamily
 
 
 class LineFamily(TaskFamily):
-    """Find a place on a line."""
+    """Find a place on a line; written for arrays."""
 
     def __init__(self) -> None:
         space = spaces.Box(-5.0, 5.0, (1,), np.float32)
@@ -22,7 +22,7 @@ class LineFamily(TaskFamily):
         return rng.uniform(-2.0, 2.0, (n, 1)).astype(np.float32)
 
     def distance(self, traj: Any, task: Any) -> Any:
-        return np.abs(traj.next_observations[..., 0] - np.asarray(task, dtype=np.float32)[..., None, 0])
+        return np.abs(traj.next_observations[..., 0] - task[..., None, 0])
 
     def compute_reward(self, traj: Any, task: Any, reward_type: str = "sparse") -> Any:
         if reward_type not in ("sparse", "dense"):

@@ -15,7 +15,7 @@ from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from gymnasium.utils.env_checker import data_equivalence
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-from helpers.broken_envs import LineFamily
+from helpers.broken_envs import LineEnv, LineFamily
 from helpers.envs import make, make_vec
 from htr_envs import Dynamics, DynamicsEnv, DynamicsVectorEnv, Trajectory, check_task_env
 
@@ -103,6 +103,13 @@ def test_rewards_of_step_are_reproduced_bit_for_bit(env_id: str) -> None:
     # as a batch of one-step trajectories, which is how a replay buffer may ask
     one_steps = Trajectory(*(values[:, None] for values in traj))
     np.testing.assert_array_equal(base.compute_reward(one_steps, goal)[:, 0], rewards)
+
+
+def test_an_env_hands_arrays_to_its_family() -> None:
+    env, states = LineEnv(), np.array([[0.0], [1.0]], dtype=np.float32)
+    traj = Trajectory(states, states, states, np.zeros(2, dtype=np.float32))
+    assert env.compute_reward(traj, [1.0]).tolist() == [0.0, 1.0]
+    assert env.hindsight_task(traj, 1).tolist() == [1.0]
 
 
 @all_envs

@@ -34,7 +34,7 @@ from sb3_htr.adaptation import Aggregate, Belief, Prior
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.safe_load import box_in_words
 from sb3_htr.common.vec_env import make_task_vec_env
-from sb3_htr.htr import EpisodeClustering
+from sb3_htr.htr import EpisodeClustering, MultiTaskReplayBuffer
 from sb3_htr.pearl.pearl import LEARNING_RATE
 from sb3_htr.pearl.policies import PEARLPolicy
 from sb3_htr.pearl.untrusted import NUMBERS, WORDS
@@ -394,6 +394,10 @@ def test_a_relabeller_that_is_an_object_is_missed(tiny_pearl: MakePEARL, tmp_pat
     tiny_pearl(replay_buffer_kwargs=settings).save(tmp_path / "model")
     with pytest.warns(UserWarning, match="replay_buffer_kwargs are in .* as no plain data, and are left at their default"):
         load_untrusted(tmp_path / "model", ENV_ID)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        loaded = load_untrusted(tmp_path / "model", ENV_ID, replay_buffer_kwargs=settings)
+    assert isinstance(loaded.replay_buffer, MultiTaskReplayBuffer) and loaded.replay_buffer.relabel_probability == 0.3
 
 
 def test_layers_of_actor_and_critics_may_differ(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
