@@ -44,7 +44,10 @@ COMPARED: dict[str, dict[str, tuple[str, ...]]] = {
         "wheeled_prior": ("pearl-dense-prior",),
     },
     "differences:rivals": {
-        "rivals": ("pearl-dense, tuned", "htr-hipi, tuned", "htr-hipi", "htr-hfr, tuned", "htr-hfr", "rl2, tuned", "rl2", "sac-her"),
+        "rivals": (
+            *("pearl-dense, tuned", "htr-hipi, tuned", "htr-hipi", "htr-hfr, tuned", "htr-hfr"),
+            *("rl2, tuned", "rl2", "sac-her"),
+        ),
         "wheeled": ("htr-hipi", "htr-hfr", "rl2", "sac-her"),
         "ant": ("htr-hipi", "htr-hfr", "rl2", "sac-her"),
     },

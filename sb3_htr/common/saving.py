@@ -48,6 +48,8 @@ class CheckedFiles(BaseAlgorithm):
     ACTS_WITH: ClassVar[dict[str, Any]] = {}
     #: Attributes, beside settings, that it acts by: ``export`` writes them, and loading by ``--trust`` or ``load`` reads them
     KEPT_TO_ACT: ClassVar[tuple[str, ...]] = ()
+    #: Attributes that ``load`` makes anew, and what saves them
+    SAVED_APART: ClassVar[dict[str, str]] = {}
 
     @classmethod
     def check_names(cls, given: Iterable[str], also: Iterable[str] = ()) -> None:
@@ -132,7 +134,12 @@ class CheckedFiles(BaseAlgorithm):
         :param path: file, ``.zip`` is added to a name without suffix; it is replaced at the end or not at all
         :param exclude: attributes to leave out
         :param include: attributes to save that would be left out
+        :raises ValueError: for one that would not be loaded
         """
+        include = [*(include or ())]
+        for name in include:
+            if name in self.SAVED_APART:
+                raise ValueError(f"{name} is no part of a model's file, and not loaded: call {self.SAVED_APART[name]}.")
         # Bounds of spaces in full, as who does not trust the file reads them
         with np.printoptions(threshold=sys.maxsize, floatmode="unique", formatter=None):
             if isinstance(path, io.IOBase):

@@ -5,7 +5,7 @@ import pathlib
 import pickle
 import warnings
 import zipfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import IO, Any, TypeVar, cast
 
@@ -91,6 +91,7 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
     """
 
     COUNTERS = (*Resumable.COUNTERS, "_n_rollouts")
+    SAVED_APART = dict.fromkeys(("replay_buffer", "task_bank"), "save_replay_buffer")
     policy: PEARLPolicy
     replay_buffer: MultiTaskReplayBuffer | None
 
@@ -643,23 +644,6 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()
         return [*state_dicts, "knowledge"], variables
-
-    def save(
-        self,
-        path: str | pathlib.Path | io.BufferedIOBase,
-        exclude: Iterable[str] | None = None,
-        include: Iterable[str] | None = None,
-    ) -> None:
-        """
-        :param path: file, ``.zip`` is added to a name without suffix; it is replaced at the end or not at all
-        :param exclude: attributes to leave out
-        :param include: attributes to save that would be left out
-        :raises ValueError: for the replay buffer, which is not read from there
-        """
-        include = [*(include or ())]
-        if "replay_buffer" in include:
-            raise ValueError("replay_buffer is no part of a model's file, and would not be loaded: call save_replay_buffer.")
-        super().save(path, exclude, include)
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """
