@@ -30,8 +30,6 @@ HEADLINES: dict[str, dict[str, tuple[str, ...]]] = {
         "ant_prior": ("htr-ser", "pearl-dense"),
     },
 }
-# Which experiment the table of rivals in README.md is of
-RIVALS = {"headline:rivals": "rivals"}
 # What the first variant of experiments is compared with
 COMPARED: dict[str, dict[str, tuple[str, ...]]] = {
     "differences": {
@@ -84,16 +82,17 @@ def rivals(summary: dict[str, Any]) -> str:
         how many times the env steps of the first method it needs
     """
     explorers: dict[str, str] = {}
-    solved: dict[tuple[str, str], dict[str, str]] = {}
+    solved: dict[tuple[str, ...], dict[str, str]] = {}
     for row in summary["rows"]:
         if row["metric"] == "success_rate" and row["explorer"] == explorers.setdefault(row["variant"], row["explorer"]):
-            solved.setdefault((row["variant"], f"{row['env_steps']:,}"), {})[place(row)] = _interval(row)
+            key = (row["variant"], f"`{row['explorer']}`", f"{row['env_steps']:,}")
+            solved.setdefault(key, {})[place(row)] = _interval(row)
     first = summary["rows"][0]["variant"]
     times = {first: "1", **{row["variant"]: _times(row) for row in summary["slowdowns"]}}
     places = list(dict.fromkeys(where for cells in solved.values() for where in cells))
     heads = [f"tasks solved, {where}" if where else "tasks solved" for where in places]
     lines = [[*key, *(cells.get(where, "") for where in places), times.get(key[0], "")] for key, cells in solved.items()]
-    return markdown_table(["method", "env steps", *heads, f"times the env steps of {first}"], lines) + "\n"
+    return markdown_table(["method", "explorer", "env steps", *heads, f"times the env steps of {first}"], lines) + "\n"
 
 
 def differences(summaries: dict[str, dict[str, Any]], methods_of: dict[str, tuple[str, ...]]) -> str:
@@ -176,7 +175,7 @@ def tables() -> dict[str, str]:
     own = {f"results:{summary['name']}": table(summary) for summary in summaries}
     by_name = {summary["name"]: summary for summary in summaries}
     headlines = {name: headline(by_name, methods_of) for name, methods_of in HEADLINES.items()}
-    headlines |= {name: rivals(by_name[experiment]) for name, experiment in RIVALS.items()}
+    headlines["headline:rivals"] = rivals(by_name["rivals"])
     return {**own, **headlines, **{name: differences(by_name, methods_of) for name, methods_of in COMPARED.items()}}
 
 

@@ -17,9 +17,9 @@ def test_rivals_are_compared_with_the_first_method() -> None:
     ]
     slowdowns = [{"variant": "slow", "iqm": 3.0, "low": 2.0, "high": None}]
     assert [line.strip("| ").split(" | ") for line in rivals({"rows": rows, "slowdowns": slowdowns}).splitlines()] == [
-        ["method", "env steps", "tasks solved", "tasks solved, goal distance 2", "times the env steps of mine"],
-        ["---"] * 5,
-        ["mine", "1,000", "100% [90%, 100%]", "90% [80%, 90%]", "1"],
-        ["slow", "1,000", "50% [40%, 50%]", "", "at least 2.0"],
-        ["untimed", "1,000", "20% [10%, 20%]"],
+        ["method", "explorer", "env steps", "tasks solved", "tasks solved, goal distance 2", "times the env steps of mine"],
+        ["---"] * 6,
+        ["mine", "`own`", "1,000", "100% [90%, 100%]", "90% [80%, 90%]", "1"],
+        ["slow", "`own`", "1,000", "50% [40%, 50%]", "", "at least 2.0"],
+        ["untimed", "`own`", "1,000", "20% [10%, 20%]"],
     ]
