@@ -147,6 +147,7 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
         self._check_actor()
+        self._actor_is_plain = type(self.actor) is Actor and type(self.actor.features_extractor) is FlattenExtractor
         self.normalizer = ObservationNormalizer(self.obs_dim) if self.normalize_observations else None
         context_dim = self.obs_dim + self.action_dim + 1
         self.encoder = self.encoder_class(context_dim, self.latent_dim, self.encoder_arch, self.activation_fn)
@@ -174,7 +175,6 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
                     f"The actor {type(self.actor).__name__} overrides {name}, which nothing calls: override "
                     "get_action_dist_params, which is all that it is asked for."
                 )
-        self._actor_is_plain = type(self.actor) is Actor and type(self.actor.features_extractor) is FlattenExtractor
 
     def make_critic(self, features_extractor: nn.Module | None = None) -> LatentCritic:  # type: ignore[override]
         kwargs: dict[str, Any] = self.critic_kwargs
