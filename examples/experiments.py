@@ -22,7 +22,8 @@ from examples import (  # noqa: F401 register the envs
     sparse_half_cheetah_velocity,
     two_link_arm,
 )
-from sb3_htr.experiments.grid import BELIEF, EXPERIMENTS, TUNED_DENSE, Experiment, Variant, by
+from sb3_htr.experiments.grid import BELIEF, EXPERIMENTS, Experiment, Variant, by
+from sb3_htr.experiments.tuned import TUNED_DENSE
 
 HTR = (Variant("htr-ser"),)
 RIVALS = (*HTR, Variant("htr-hfr"), Variant("htr-hipi"))
