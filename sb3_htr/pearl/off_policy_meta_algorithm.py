@@ -1,15 +1,10 @@
-"""What off-policy meta-algorithms share: rollouts that adapt, adaptation at meta-test, files and state."""
+"""What off-policy meta-algorithms share in meta-training: rollouts that adapt, and a replay that is ordered by task."""
 
-import io
-import pathlib
-import pickle
 import warnings
-import zipfile
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import IO, Any, TypeVar, cast
+from typing import Any, TypeVar, cast
 
-import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -20,27 +15,22 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.sac import SAC
 
 from sb3_htr.adaptation.adaptation import Adaptation, Step
-from sb3_htr.adaptation.agent import AdaptedAgent
 from sb3_htr.adaptation.explorers import Explorer, to_explorer
 from sb3_htr.adaptation.explorers.prior import FixedExploration
 from sb3_htr.adaptation.knowledge import LatentKnowledge
-from sb3_htr.adaptation.loop import adaptation_steps, first_observations
+from sb3_htr.adaptation.loop import adaptation_steps
 from sb3_htr.adaptation.task_bank import TaskBank
 from sb3_htr.common import checks
-from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.callback import followed_by
 from sb3_htr.common.family_facts import check_same_family, family_facts
-from sb3_htr.common.latent_policy import Obs, State
 from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.random_state import (
-    MAX_SEED,
     checked_seed,
     get_generator_state,
-    seeded_actions,
     set_generator_state,
     stream,
 )
-from sb3_htr.common.saving import CheckedFiles, with_suffix
+from sb3_htr.common.saving import CheckedFiles
 from sb3_htr.common.settings import check_class, check_keywords, check_mappings, check_numbers, plain
 from sb3_htr.common.training_state import Resumable
 from sb3_htr.common.vec_env import make_task_vec_env
@@ -48,7 +38,9 @@ from sb3_htr.common.vec_wrappers import in_float32, seed_envs
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.htr.reward_hook import check_reward_hook
 from sb3_htr.pearl.horizon import BY_HORIZON, STEPS_PER_UPDATE, complete, timesteps_for
+from sb3_htr.pearl.meta_test import MetaTest
 from sb3_htr.pearl.policies import PEARLPolicy
+from sb3_htr.pearl.replay_files import ReplayFiles
 
 # Arguments of the policy, and of the replay buffer, that are the model's
 GIVEN_TO_POLICY = ("observation_space", "action_space", "lr_schedule")
@@ -68,7 +60,7 @@ MAX_STEPS_PER_UPDATE = 1000
 SelfMetaAlgorithm = TypeVar("SelfMetaAlgorithm", bound="OffPolicyMetaAlgorithm")
 
 
-class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
+class OffPolicyMetaAlgorithm(MetaTest, ReplayFiles, CheckedFiles, SAC):
     """
     SAC whose rollouts are adaptations to training tasks and whose replay is ordered by task. A subclass adds ``train``.
 
@@ -91,9 +83,6 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
     """
 
     COUNTERS = (*Resumable.COUNTERS, "_n_rollouts")
-    SAVED_APART = dict.fromkeys(("replay_buffer", "task_bank"), "save_replay_buffer")
-    policy: PEARLPolicy
-    replay_buffer: MultiTaskReplayBuffer | None
 
     def __init__(
         self,
@@ -152,11 +141,9 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
         #: model has had no env yet
         self.max_episode_steps: int | None = None
         self.n_rollout_tasks: int | None = None
-        self.task_bank: TaskBank | None = None
         #: Called after each update
         self.update_listeners: list[Callable[[], None]] = []
         self._n_rollouts = 0
-        self._warned_not_adapted = False
 
     def _setup_model(self) -> None:
         if self.env is None and not hasattr(self, "observation_space"):
@@ -261,14 +248,6 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
             self.knowledge.set_tells_success(self.replay_buffer.tells_rewards)
             for explorer in (self.explorer, self.train_explorer):
                 self._check_explorer(explorer, self.knowledge.tells_success)
-
-    @staticmethod
-    def _check_explorer(explorer: Explorer, tells_success: bool) -> None:
-        if explorer.needs_success and not tells_success:
-            raise ValueError(
-                f"The explorer {explorer.name!r} goes by successes, of which the env's task_family tells nothing: pass "
-                "explorer='prior' (and in a training train_explorer='prior', on the command line --method pearl-sparse-prior)."
-            )
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
@@ -497,214 +476,17 @@ class OffPolicyMetaAlgorithm(CheckedFiles, Resumable, SAC):
                 "dummy) show it here."
             ) from error
 
-    # Meta-test
-
-    def check_env(self, env: VecEnv) -> None:
-        """
-        :param env: to adapt in
-        :raises ValueError: if its spaces do not fit those of training, or it normalizes
-        """
-        checks.check_is_not_normalized(env)
-        checks.check_fits(self._wrap_env(env), self.observation_space, self.action_space)
-
-    def start_adaptation(
-        self,
-        n_envs: int,
-        explorer: Explorer | dict[str, Any] | str | None = None,
-        generator: th.Generator | None = None,
-        is_training: bool = False,
-    ) -> Adaptation:
-        """
-        :param n_envs: number of tasks to adapt to side by side
-        :param explorer: an explorer, its name, or its name and settings; by default, and where the name alone is that of the
-            model's own, the model's own
-        :param generator: source of randomness; torch's global one by default
-        :param is_training: whether infos tell which part of a reward depends on no task
-        :return: chooses z and takes in what happens
-        :raises ValueError: if the explorer goes by successes, and the model was trained on a family without
-        """
-        own = to_explorer(self.explorer)
-        chosen = own if explorer in (None, own.name) else to_explorer(explorer)
-        self._check_explorer(chosen, self.knowledge.tells_success)
-        check_numbers(n_envs=(n_envs, 1))
-        self.policy.set_training_mode(False)
-        return Adaptation(
-            self.policy,
-            self.knowledge,
-            chosen,
-            n_envs,
-            gamma=self.gamma,
-            context_size=self.context_size,
-            generator=generator,
-            is_training=is_training,
-        )
-
-    def adapt(
-        self,
-        env: gym.Env | VecEnv | str,
-        n_episodes: int = 5,
-        task: int | np.ndarray | None = None,
-        explorer: Explorer | dict[str, Any] | str | None = None,
-        deterministic: bool = True,
-        seed: int = 0,
-    ) -> AdaptedAgent:
-        """
-        Adapt to one task by trying it, from observations, actions and rewards.
-
-        :param env: env with the task, or an id. It need not be of the task family that the model knows, or of any: an env of
-            the same spaces, such as the real robot, is enough, if its episodes are all of one task
-        :param n_episodes: episodes to adapt in. The agent then acts with the ``final_z`` of the explorer: of ``"belief"``, z
-            of the best one that had a single z, or the one that promises most, where that found little of what there is; of
-            ``"prior"``, a draw from the posterior over all of them
-        :param task: index of a training task or task vector; by default the task that the env was given, or one that it draws.
-            The env keeps it. An env without task family takes none
-        :param explorer: an explorer, its name, or its name and settings; the model's own by default
-        :param deterministic: adapt with mean actions instead of samples
-        :param seed: seed of z, and of the actions if they are samples
-        :return: an agent for this task, with the returns of its adaptation episodes, and whether each was a success: if the
-            env does not say so (``info["is_success"]``), whether a reward was told from what is task-free
-        :raises ValueError: for several envs, an env with other spaces, a task that the env does not have, episodes without end
-        """
-        check_numbers(n_episodes=(n_episodes, 1), seed=(seed, 0, MAX_SEED))
-        vec_env = self._wrap_env(gym.make(env) if isinstance(env, str) else env, monitor_wrapper=False)
-        if vec_env.num_envs != 1:
-            raise ValueError(f"adapt() adapts to one task, but the VecEnv has {vec_env.num_envs} envs: pass a single env.")
-        self.check_env(vec_env)
-        # What has no task family may have no time limit that could be read, as a robot
-        longest = self.max_episode_steps
-        if vec_env.has_attr("task_family"):
-            longest = checks.get_max_episode_steps(vec_env)
-            if task is None:
-                vec_env.reset()
-                # Of an env that names its task by the index alone, that
-                has_vector = vec_env.has_attr("task")
-                task = np.array(vec_env.get_attr("task")[0] if has_vector else vec_env.unwrapped.reset_infos[0]["task_id"])
-            if np.ndim(task) == 0 and not np.issubdtype(np.asarray(task).dtype, np.integer):
-                raise ValueError(f"task is {task!r}: pass the index of a training task, or a task as a vector, [{task!r}].")
-            # Before the env has it: after a reset that failed, an env without a first observation would be stepped
-            family = checks.get_task_family(vec_env)
-            if np.ndim(task) == 0 and hasattr(family, "task_indices"):
-                family.task_indices(task, ())
-            elif np.ndim(task) > 0 and hasattr(family, "task_vectors"):
-                family.task_vectors(task, family.train_tasks.shape[1:])
-            vec_env.set_options({"task_id": int(task)} if np.ndim(task) == 0 else {"task": np.asarray(task, dtype=np.float32)})
-        elif task is not None:
-            raise ValueError("The env has no task family, so it takes no task: leave task out, and set its task yourself.")
-        seed = int(seed)  # torch takes no numbers of numpy
-        adaptation = self.start_adaptation(1, explorer, th.Generator().manual_seed(seed))
-        returns, successes = np.zeros(n_episodes), np.zeros(n_episodes, dtype=bool)
-        act = partial(adaptation.act, deterministic=deterministic)
-        obs = first_observations(vec_env)
-        if task is not None and np.ndim(task) > 0:
-            checks.check_tasks(vec_env, np.asarray(task, dtype=np.float32)[None])
-        elif task is not None:
-            checks.check_task_ids(vec_env, np.atleast_1d(task))
-        with seeded_actions(seed, deterministic):
-            for step in adaptation_steps(vec_env, adaptation, n_episodes, self.policy.unscale_action, act, obs, longest):
-                episode = adaptation.n_episodes[0] - step.dones[0]
-                returns[episode] += step.rewards[0]
-                # Some envs give a number
-                successes[episode] |= bool(step.infos[0].get("is_success", adaptation.task_reward[0] > 0))
-        if adaptation.best_return[0] <= 0 and self.knowledge.tells_success:
-            warnings.warn(
-                f"No reward was found in {n_episodes} episodes, so the agent is not adapted: allow more, or train longer. If "
-                "there was a success, its reward is on another scale than in meta-training: the most rewarded step returned "
-                f"{adaptation.largest_reward[0]:.2g} more than steps without success do, and at least "
-                f"{self.knowledge.threshold.item():.2g} would be one.",
-                stacklevel=2,
-            )
-        return AdaptedAgent(self.policy, adaptation.explorer.final_z()[0], returns, successes)
-
-    def predict(
-        self, observation: Obs, state: State = None, episode_start: np.ndarray | None = None, deterministic: bool = False
-    ) -> tuple[np.ndarray, State]:
-        """
-        :param observation: (obs_dim,) or (n, obs_dim)
-        :param state: tuple of one array, z of each observation (n, latent_dim); without it the agent is not adapted to any
-            task, which is warned of once
-        :param episode_start: ignored: z lives longer than an episode
-        :param deterministic: mean action instead of a sample
-        :return: actions, and the state for the next call
-        """
-        if state is None and not self._warned_not_adapted:
-            self._warned_not_adapted = True
-            warnings.warn(
-                "This PEARL is not adapted to any task, so it acts with the prior mean of z. To see what it can do, use "
-                "sb3_htr.evaluate_adaptation(model, env), or evaluate_policy(model.adapt(env), env).",
-                stacklevel=2,
-            )
-        return self.policy.predict(observation, state, episode_start, deterministic)
-
     # Files and state
 
     def _excluded_save_params(self) -> list[str]:
-        own = ["knowledge", "task_bank", "update_listeners", "_warned_not_adapted", "_rng", "_task_queue"]
-        return [*super()._excluded_save_params(), *own]
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        state_dicts, variables = super()._get_torch_save_params()
-        return [*state_dicts, "knowledge"], variables
-
-    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
-        """
-        Save replay and what was learnt of it, as plain arrays.
-
-        :param path: file, ``.pt`` is added to a name without suffix; it is replaced at the end or not at all
-        :raises ValueError: for a model that was loaded without an env
-        """
-        state = self._replay_state()
-        if isinstance(path, io.IOBase):
-            return th.save(state, cast(IO[bytes], path))
-        with atomic_path(with_suffix(path, ".pt")) as temporary:
-            th.save(state, temporary)
-
-    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
-        """
-        :param path: file of ``save_replay_buffer``; reading it runs no code
-        :param truncate_last_traj: not used, only whole episodes are stored
-        :raises ValueError: if it is no such file, or one of a model with other settings
-        """
-        own_replay, own_task_bank = self._replay()
-        file: Any = path if isinstance(path, io.IOBase) else with_suffix(path, ".pt")
-        try:
-            # torch writes a zip file, and does not look at its checksums
-            with zipfile.ZipFile(file) as archive:
-                if archive.testzip() is not None:
-                    raise EOFError
-            if isinstance(file, io.IOBase):
-                file.seek(0)
-            state = th.load(file, weights_only=True)
-            replay, task_bank = state["replay"], state["task_bank"]
-        except (RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError, zipfile.BadZipFile):
-            raise ValueError(
-                f"{path} is damaged, or no replay buffer of sb3_htr: pass a file that save_replay_buffer has written."
-            ) from None
-        own_task_bank.check(task_bank)
-        try:
-            own_replay.load_state_dict(replay)
-        except KeyError as missing:
-            raise ValueError(f"{path} has no {missing}: make the model with the relabeller that it was saved with.") from None
-        own_task_bank.load_state_dict(task_bank)
-
-    def _replay(self) -> tuple[MultiTaskReplayBuffer, TaskBank]:
-        if self.replay_buffer is None or self.task_bank is None:
-            raise ValueError("This model has no env, so it has no replay buffer: pass env=... to load, or call set_env.")
-        return self.replay_buffer, self.task_bank
-
-    def _replay_state(self) -> dict[str, Any]:
-        replay, task_bank = self._replay()
-        return {"replay": replay.state_dict(), "task_bank": task_bank.state_dict()}
+        return [*super()._excluded_save_params(), "update_listeners", "_rng", "_task_queue"]
 
     def state_dict(self) -> dict[str, Any]:
-        replay = self._replay_state()
-        return {**super().state_dict(), **replay, "task_queue": th.from_numpy(self._task_queue.copy())}
+        return {**super().state_dict(), "task_queue": th.from_numpy(self._task_queue.copy())}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        replay, task_bank = self._replay()
         super().load_state_dict(state)
         self._task_queue = state["task_queue"].numpy().copy()
-        replay.load_state_dict(state["replay"])
-        task_bank.load_state_dict(state["task_bank"])
 
     def _get_random_state(self) -> dict[str, Any]:
         return {**super()._get_random_state(), "model": get_generator_state(self._rng)}
