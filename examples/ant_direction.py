@@ -82,7 +82,7 @@ if __name__ == "__main__":
 
     # Two episodes with a z of the prior, then of the posterior
     prior = {"name": "prior", "n_exploration_episodes": 2}
-    plain = {"replay_buffer_kwargs": {"relabel_probability": 0.0}, "explorer": prior, "train_explorer": prior}
+    plain: dict[str, Any] = {"replay_buffer_kwargs": {"relabel_probability": 0.0}, "explorer": prior, "train_explorer": prior}
     model = PEARL("MlpPolicy", "AntDirection-v0", **plain, n_episodes_per_task=4, context_size=200, seed=0, verbose=1)
     returns, _ = evaluate_adaptation(model.learn(1_000_000), "AntDirection-v0", n_episodes=3)
     print(f"return of episodes 1 to 3: {returns.mean(axis=0).round(1)}")

@@ -12,15 +12,15 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from htr_envs import MetaEnv, TaskDistribution
-from htr_envs.point_robot import PointRobotEnv, PointRobotFamily
+from htr_envs import MetaEnv, TaskDistribution, TaskFamily
+from htr_envs.point_robot import PointRobotEnv
 from htr_envs.task_env import FloatArray
 
 
 class Goals(TaskDistribution):
     """The tasks of a family without its hook: with dense rewards there is nothing to relabel, nor to know beforehand."""
 
-    def __init__(self, family: PointRobotFamily) -> None:
+    def __init__(self, family: TaskFamily) -> None:
         self.family = family
         super().__init__(family.task_space, family.train_tasks, family.validation_tasks, family.test_tasks)
 
@@ -49,8 +49,8 @@ class DensePointRobotEnv(MetaEnv):
         return obs, reward, terminated
 
     def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
-        *result, info = super().step(action)
-        return *result, {**info, "is_success": self.robot_info["is_success"]}
+        obs, reward, terminated, truncated, info = super().step(action)
+        return obs, reward, terminated, truncated, {**info, "is_success": self.robot_info["is_success"]}
 
 
 gym.register("DensePointRobot-v0", entry_point=DensePointRobotEnv, max_episode_steps=20)

@@ -59,13 +59,13 @@ class TwoLinkArmFamily(TaskFamily):
 
     def sample_tasks(self, n: int, rng: np.random.Generator) -> FloatArray:
         angle, distance = rng.uniform(0, 2 * np.pi, n), rng.uniform(self.nearest, self.farthest, n)
-        return np.float32(distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+        return (distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)).astype(np.float32)
 
     def compute_reward(self, traj: Trajectory, task: ArrayLike, reward_type: str = "sparse") -> FloatArray:
         check_reward_type(reward_type)
         distance = self._distance(traj, task)
         sparse = np.where(distance < self.goal_radius, 1 - distance, 0)
-        return np.float32((-distance if reward_type == "dense" else sparse) + traj.task_free_reward)
+        return ((-distance if reward_type == "dense" else sparse) + traj.task_free_reward).astype(np.float32)
 
     def is_success(self, traj: Trajectory, task: ArrayLike) -> BoolArray:
         return np.asarray(self._distance(traj, task) < self.goal_radius)

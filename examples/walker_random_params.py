@@ -91,7 +91,7 @@ if __name__ == "__main__":
 
     # One episode with a z of the prior, then of the posterior
     prior = {"name": "prior", "n_exploration_episodes": 1}
-    plain = {"replay_buffer_kwargs": {"relabel_probability": 0.0}, "explorer": prior, "train_explorer": prior}
+    plain: dict[str, Any] = {"replay_buffer_kwargs": {"relabel_probability": 0.0}, "explorer": prior, "train_explorer": prior}
     model = PEARL("MlpPolicy", "WalkerRandomParams-v0", **plain, n_episodes_per_task=3, context_size=100, seed=0, verbose=1)
     returns, _ = evaluate_adaptation(model.learn(1_000_000), "WalkerRandomParams-v0", n_episodes=3)
     print(f"return of episodes 1 to 3: {returns.mean(axis=0).round(1)}")

@@ -81,8 +81,8 @@ class DynamicsEnv(TaskEnv):
 
     def __init__(
         self,
-        task_family: Family,
-        dynamics: Dynamics[Family],
+        task_family: TaskFamily,
+        dynamics: Dynamics[Any],
         reward_type: str = "sparse",
         render_mode: str | None = None,
     ) -> None:
@@ -92,7 +92,7 @@ class DynamicsEnv(TaskEnv):
         if dynamics.num_envs != 1:
             raise ValueError(f"The dynamics have {dynamics.num_envs} copies, a single env needs dynamics of one.")
         super().__init__(task_family, reward_type)
-        self.dynamics: Dynamics[Any] = dynamics
+        self.dynamics = dynamics
         self.observation_space = dynamics.observation_space
         self.action_space = dynamics.action_space
         self.render_mode = render_mode
@@ -144,14 +144,14 @@ class DynamicsVectorEnv(TaskVectorEnv):
 
     def __init__(
         self,
-        task_family: Family,
-        dynamics: Dynamics[Family],
+        task_family: TaskFamily,
+        dynamics: Dynamics[Any],
         max_episode_steps: int | None = None,
         reward_type: str = "sparse",
     ) -> None:
         one_copy = dynamics.observation_space, dynamics.action_space
         super().__init__(task_family, dynamics.num_envs, *one_copy, max_episode_steps, reward_type)
-        self.dynamics: Dynamics[Any] = dynamics
+        self.dynamics = dynamics
 
     def _reset_state(self, indices: NDArray[np.int64]) -> FloatArray:
         return self.dynamics.reset(indices, self.np_random)

@@ -199,8 +199,9 @@ class MetaEnv(HasTaskFamily, gym.Env[FloatArray, FloatArray], ABC):
     :param task_family: the tasks.
     """
 
-    observation_space: spaces.Box  # type: ignore[assignment]
-    action_space: spaces.Box  # type: ignore[assignment]
+    # Boxes; gymnasium does not know of its own envs, which a subclass may have inside, that theirs are
+    observation_space: Any
+    action_space: Any
 
     def __init__(self, task_family: TaskDistribution) -> None:
         self.task_family = task_family

@@ -23,11 +23,14 @@ class ScriptedAgent:
     :param action_space: Box
     :param script: observations (n, obs_dim) and the tasks to solve (n, task_dim) to actions (n, action_dim), scaled to
         [-1, 1]; by default, actions are uniformly random, whatever the task
+    :raises ValueError: for another action space
     """
 
     explorer = OwnWay()
 
-    def __init__(self, action_space: spaces.Box, script: Script | None = None) -> None:
+    def __init__(self, action_space: spaces.Space[Any], script: Script | None = None) -> None:
+        if not isinstance(action_space, spaces.Box):
+            raise ValueError(f"action_space is {action_space}, expected a Box: a script's actions are scaled to its bounds.")
         self.action_space = action_space
         self.script = script
 

@@ -33,7 +33,7 @@ def test_evaluations_and_trainings_of_consecutive_seeds_share_no_env(monkeypatch
 
     monkeypatch.setattr(evaluation, "reset_to_tasks", remembered)
     env = DummyVecEnv([lambda: gym.make("SparseWheeled-v0")] * 4)
-    agent = ScriptedAgent(env.action_space)  # type: ignore[arg-type]
+    agent = ScriptedAgent(env.action_space)
     tasks = env.get_attr("task_family")[0].test_tasks[:4]
     for seed in (1, 2):
         evaluate_adaptation(agent, env, tasks, n_episodes=1, seed=seed)

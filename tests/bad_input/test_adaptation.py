@@ -108,6 +108,8 @@ def test_only_the_envs_of_a_model_can_be_adapted_to(tiny_pearl: MakePEARL) -> No
         other = ENV_ID if isinstance(agent, ScriptedAgent) else "SparseTargetSpeed-v0"
         with pytest.raises(ValueError, match="spaces do not match"):
             evaluate_adaptation(agent, other, n_episodes=1)
+    with pytest.raises(ValueError, match=r"Discrete\(2\), expected a Box"):
+        ScriptedAgent(spaces.Discrete(2))
 
 
 @pytest.mark.parametrize("explorer", ["belief", "prior", "aggregate", "learned-prior"])

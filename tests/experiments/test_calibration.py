@@ -44,7 +44,7 @@ def test_a_success_may_be_worth_0_and_all_else_less(model: PEARL, monkeypatch: p
     family = {"goal_distance": 0.5, "n_validation_tasks": 6}
 
     def pairs_and_successes() -> list[float]:
-        walk = ScriptedAgent(make_task_vec_env(ENV_ID).action_space)  # type: ignore[arg-type]
+        walk = ScriptedAgent(make_task_vec_env(ENV_ID).action_space)
         monkeypatch.setattr(model, "start_adaptation", walk.start_adaptation)
         return calibration(model, ENV_ID, family, 20)[:, [0, 2]].sum(axis=0).tolist()
 
