@@ -30,6 +30,7 @@ from sb3_htr.zoo.run.algorithm import ALGORITHMS
 from sb3_htr.zoo.run.manager import MetaExperimentManager
 from sb3_htr.zoo.run.method import PEARLMethod, get_method, merged, methods
 from sb3_htr.zoo.run.record import RECORD
+from sb3_htr.zoo.run.search_manager import SearchManager
 from sb3_htr.zoo.run.study import absolute, without_password
 
 SMALL = ["-params", "n_tasks_per_rollout:4", "n_episodes_per_task:3", "learning_starts:240", "n_envs:4"]
@@ -96,6 +97,12 @@ def test_a_study_is_of_one_env_and_one_method(quick: None, tmp_path: Path) -> No
     trained = ["train", "--env", ENV_ID, "--method", "pearl-sparse", "-f", str(tmp_path), "--storage", storage]
     with pytest.raises(ValueError, match="The study 'test' is of method htr-ser, and not pearl-sparse"):
         main([*trained, "--study-name", "test", "--trial-id", "0"])
+
+
+def test_a_search_begins_with_new_networks(quick: None, tmp_path: Path) -> None:
+    (tmp_path / "model.zip").touch()
+    with pytest.raises(ValueError, match=r"begin with new networks: leave -i out"):
+        search(tmp_path, f"sqlite:///{tmp_path}/study.db", "-i", str(tmp_path / "model.zip"))
 
 
 def test_a_mistyped_env_leaves_the_name_of_the_study_free(quick: None, tmp_path: Path) -> None:
@@ -350,7 +357,7 @@ def test_a_search_without_a_finished_trial_says_so(
     def stop(*args: Any) -> float:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(MetaExperimentManager, "objective", stop)
+    monkeypatch.setattr(SearchManager, "objective", stop)
     assert search(tmp_path, f"sqlite:///{tmp_path}/study.db") == 0
     assert "no trial was finished. The same command goes on" in capsys.readouterr().out
 

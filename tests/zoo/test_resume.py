@@ -26,8 +26,8 @@ from sb3_htr.common.checkpoint import checkpoints, load_latest, write_checkpoint
 from sb3_htr.common.checkpoint_callback import cut_monitor_files
 from sb3_htr.common.versions import named
 from sb3_htr.zoo.cli import main
-from sb3_htr.zoo.run.manager import MetaExperimentManager
 from sb3_htr.zoo.run.shipped import hyperparams_file
+from sb3_htr.zoo.run.training_manager import TrainingManager
 
 # Rollouts of 4 tasks x 3 episodes x 20 steps, 10 of them, a checkpoint after each
 STEPS = 2400
@@ -417,13 +417,13 @@ def test_the_command_that_is_printed_to_go_on_is_taken(
         settings = [f"callback:'{__name__}.InterruptsOnce'"]
     else:
         settings = []
-        learn = MetaExperimentManager.learn
+        learn = TrainingManager.learn
 
         def interrupted(manager: Any, model: Any) -> None:
             manager.callbacks.append(InterruptsOnce())
             learn(manager, model)
 
-        monkeypatch.setattr(MetaExperimentManager, "learn", interrupted)
+        monkeypatch.setattr(TrainingManager, "learn", interrupted)
     few = ["train", "--env", ENV_ID, "-f", str(tmp_path), "--save-freq", "1", "--eval-freq", "-1", "--verbose", "0"]
     with pytest.raises(KeyboardInterrupt):
         main([*few, *given, "-params", *SMALL, *NETS, *settings])

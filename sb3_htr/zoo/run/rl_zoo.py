@@ -18,6 +18,8 @@ from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.zoo.run.algorithm import Algorithm
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback
 from sb3_htr.zoo.run.manager import MetaExperimentManager
+from sb3_htr.zoo.run.search_manager import SearchManager
+from sb3_htr.zoo.run.training_manager import TrainingManager
 
 
 def run_rl_zoo(
@@ -41,7 +43,11 @@ def run_rl_zoo(
     ALGOS[algorithm.name] = algorithm.model_class
     if algorithm.search_space is not None:
         HYPERPARAMS_CONVERTER[algorithm.name] = algorithm.search_space.convert
-    manager = partial(MetaExperimentManager, method=method, resumed=resumed, trust=trust)
+
+    def make_manager(args: argparse.Namespace, *rest: Any, **kwargs: Any) -> MetaExperimentManager:
+        manager = SearchManager if args.optimize_hyperparameters else TrainingManager
+        return manager(args, *rest, method=method, resumed=resumed, trust=trust, **kwargs)
+
     # rl_zoo3 looks these names up when it needs them
     replaced: dict[ModuleType, dict[str, Any]] = {
         exp_manager: {
@@ -51,7 +57,7 @@ def run_rl_zoo(
             "ProgressBarCallback": MetaProgressBarCallback,
         },
         rl_zoo3.train: {
-            "ExperimentManager": manager,
+            "ExperimentManager": make_manager,
             "ALGOS": {algorithm.name: algorithm.model_class},
             # Records are read by full names
             "argparse": SimpleNamespace(ArgumentParser=partial(argparse.ArgumentParser, allow_abbrev=False)),

@@ -67,14 +67,14 @@ def check_is_there(storage: str) -> None:
         raise ValueError(f"--storage is {storage}, and there is no file {file}: give that of `sb3-htr optimize`.")
 
 
-def check_is_of(storage: str, name: str | None, facts: dict[str, Any], note: bool) -> None:
+def check_is_of(storage: str, name: str | None, facts: dict[str, Any], note: bool = False) -> None:
     """
     Trials of several envs, methods or budgets have no best one, and settings of one are none of another.
 
     :param storage: as given
     :param name: of a study, which need not be there
     :param facts: what a training, or a search, is of
-    :param note: write them into the study
+    :param note: whether to write them into the study
     :raises ValueError: if the study is of others; older ones do not say
     """
     try:

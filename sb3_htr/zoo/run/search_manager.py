@@ -1,0 +1,82 @@
+"""A search for hyperparameters by rl_zoo3 and Optuna."""
+
+import traceback
+from pathlib import Path
+from typing import Any
+
+import optuna
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_htr.pearl.divergence import DivergedError
+from sb3_htr.zoo.run.manager import MetaExperimentManager
+from sb3_htr.zoo.run.method import merged, names_of
+from sb3_htr.zoo.run.study import check_is_of
+
+
+class SearchManager(MetaExperimentManager):
+    """Of one worker of a study."""
+
+    def _settings_of_trial(self, trial_id: int | None) -> dict[str, Any]:
+        if self.method.algorithm.search_space is None:
+            raise ValueError(
+                f"Nothing is known of what to search for {self.method.name}: give register_algorithm a search_space, or "
+                "choose another --method."
+            )
+        if self.continue_training:
+            raise ValueError("The trials of a search begin with new networks: leave -i out.")
+        if self.storage is not None:
+            facts = {
+                "env": self.env_name.gym_id,
+                "method": self.method.name,
+                "env-kwargs": self.env_kwargs,
+                "n-timesteps": self.n_timesteps,
+                "hyperparams": self._given,
+            }
+            check_is_of(self.storage, self.study_name, facts, note=True)
+        return {}
+
+    def create_log_folder(self) -> None:
+        """Trials have none."""
+
+    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
+        """
+        :param n_envs: number of envs
+        :param eval_env: whether the envs are for evaluation
+        :param no_log: whatever it is, no monitor file is written: envs for a look at their spaces are no run
+        :return: the envs
+        """
+        return super().create_envs(n_envs, eval_env, no_log=True)
+
+    def objective(self, trial: optuna.Trial) -> float:
+        """
+        :param trial: gives the hyperparameters
+        :return: mean return of the last adaptation episode on the validation tasks
+        :raises optuna.TrialPruned: for hyperparameters that promise little or diverge
+        """
+        try:
+            space = self.method.algorithm.search_space
+            assert space is not None
+            sampled = space.sample(trial, names_of(self._given) | self.method.not_searched())
+            # To rl_zoo3, dicts of the file are gone where the sampler has one
+            HYPERPARAMS_SAMPLER[self.algo] = lambda *_: merged(self._hyperparams, self._preprocess_schedules(sampled))
+            return super().objective(trial)
+        except DivergedError as error:
+            print(f"Trial {trial.number} is pruned: {error}")
+            raise optuna.TrialPruned from error
+
+    def hyperparameters_optimization(self) -> None:
+        """Search. Where the report goes is looked at first."""
+        Path(self.log_folder, self.algo).mkdir(parents=True, exist_ok=True)
+        try:
+            super().hyperparameters_optimization()
+        except ValueError as error:
+            if all(frame.name != "best_trial" for frame in traceback.extract_tb(error.__traceback__)):
+                raise
+            print("none: no trial was finished. The same command goes on.")
+
+    def _create_sampler(self, sampler_method: str) -> optuna.samplers.BaseSampler:
+        sampler = super()._create_sampler(sampler_method)
+        if self.storage is not None:  # workers of one study, with one command, must not draw alike
+            sampler.reseed_rng()
+        return sampler

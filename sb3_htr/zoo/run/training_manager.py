@@ -1,0 +1,225 @@
+"""One training by rl_zoo3: its folder, its checkpoints, its record, and how it ends."""
+
+import contextlib
+import importlib
+import shutil
+import sys
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any, cast
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.utils import get_device
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_htr.common.checkpoint import checkpoints, load_latest
+from sb3_htr.common.checkpoint_callback import CheckpointCallback, cut_monitor_files
+from sb3_htr.common.errors import WRITE_ERRORS, reason
+from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.common.versions import hardware, made_by
+from sb3_htr.pearl.divergence import DivergedError
+from sb3_htr.zoo.run.callbacks import ProgressCallback
+from sb3_htr.zoo.run.folder import SystemLock, claim, lock
+from sb3_htr.zoo.run.manager import MetaExperimentManager
+from sb3_htr.zoo.run.record import RECORD, command_to_go_on, read_record, record_going_on, write_record
+from sb3_htr.zoo.run.soft_interrupt import soft_interrupt
+from sb3_htr.zoo.run.study import check_is_of, check_is_there
+from sb3_htr.zoo.run.train_arguments import given_arguments
+from sb3_htr.zoo.run.trust import check_arguments, plain_settings
+
+
+class TrainingManager(MetaExperimentManager):
+    """Of a run that is new, or goes on from its latest checkpoint."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._unique = kwargs.get("uuid_str", "")
+        self._claimed: Path | None = None
+        # The record of a run that goes on otherwise than it was begun
+        self._going_on: dict[str, Any] | None = None
+        self._lock: SystemLock | None = None
+        self._interrupted = False
+
+    def _settings_of_trial(self, trial_id: int | None) -> dict[str, Any]:
+        named = {"--storage": self.storage, "--study-name": self.study_name, "--trial-id": trial_id}
+        missing = [option for option, value in named.items() if value is None]
+        if len(missing) == 3:
+            return {}
+        if missing or trial_id is None or trial_id < 0:
+            add = ", ".join(missing) or "another number"
+            raise ValueError(f"A trial is named by {', '.join(named)}, from 0 on: add {add}.")
+        assert self.storage is not None and self.study_name is not None
+        check_is_there(self.storage)
+        check_is_of(self.storage, self.study_name, {"env": self.env_name.gym_id, "method": self.method.name})
+        try:
+            trial: dict[str, Any] = self.load_trial(self.storage, self.study_name, trial_id)
+        except (KeyError, IndexError):
+            raise ValueError(
+                f"{self.storage} has no study {self.study_name!r} with a trial {trial_id}: `sb3-htr optimize` prints both."
+            ) from None
+        print(f"With those of trial {trial_id}: {trial}")
+        return trial
+
+    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
+        """
+        :return: the model and its hyperparameters
+        """
+        try:
+            return super().setup_experiment()
+        except BaseException:
+            if self._claimed is not None:  # nothing was trained in it
+                shutil.rmtree(self._claimed)
+            if self._lock is not None:
+                self._lock.release()
+            raise
+
+    def create_log_folder(self) -> None:
+        """Make the run's folder, or take the one of the run that goes on."""
+        if self.tensorboard_log:
+            importlib.import_module("tensorboard")  # missing, it should be said before anything is written
+        if self.resumed is None:
+            # An env that cannot be trained on should say so before there is a folder
+            make_task_vec_env(self.env_name.gym_id, env_kwargs=self.env_kwargs, wrapper=self.env_wrapper).close()
+            self._claimed = claim(self.log_path, self.env_name, self._unique)
+            self.save_path = str(self._claimed)
+            self._lock = lock(self._claimed)
+        else:
+            self.save_path = str(self.resumed)
+            self._lock = lock(self.resumed)
+            folder, self._checkpoint = load_latest(self.resumed)
+            cut_monitor_files(self.resumed, folder, self._checkpoint["monitor_files"])
+            print(f"Going on from {folder}")
+        self.params_path = f"{self.save_path}/{self.env_name}"
+        super().create_log_folder()
+
+    def create_callbacks(self) -> None:
+        """Add the log of training, ``progress.csv``."""
+        super().create_callbacks()
+        self.callbacks.append(ProgressCallback(Path(self.save_path) / "progress.csv"))
+        self._checkpointing = next((call for call in self.callbacks if isinstance(call, CheckpointCallback)), None)
+        if self._checkpointing is not None:
+            self.callbacks.remove(self._checkpointing)
+            self._checkpointing.companions = list(self.callbacks)
+            # Behind the evaluation at the end of a training, and before the file of the progress is closed
+            self.callbacks.insert(-1, self._checkpointing)
+
+    def learn(self, model: BaseAlgorithm) -> None:
+        """
+        Train, from the checkpoint on if a run is resumed. A first interrupt stops before the next rollout, a second at once.
+
+        :param model: as set up
+        """
+        done = 0
+        usual = self.method.algorithm.usual_timesteps(model)
+        if self.args.n_timesteps == -1 and self.n_timesteps < usual:
+            # The block `default` has the budget of short episodes
+            print(
+                f"The budget of {self.config} is {self.n_timesteps:,} env steps, that of `learn()` for such episodes "
+                f"{usual:,}: -n {usual} takes it."
+            )
+        if self.resumed is not None:
+            assert self._checkpointing is not None, "a run that has a checkpoint makes them"
+            self._checkpointing.restore(cast(Any, model), self._checkpoint)
+            done = model.num_timesteps
+            if self._going_on is not None:  # not before: a run that is refused has the plan that it had
+                write_record(Path(self.save_path), self._going_on)
+        log_interval = {-1: 1}.get(self.log_interval, self.log_interval if self.log_interval > 0 else None)
+        with contextlib.ExitStack() as on_failure, soft_interrupt(self._checkpointing):
+            assert self._lock is not None
+            on_failure.callback(self._lock.release)
+            try:
+                n_steps = max(int(self.n_timesteps) - done, 0)
+                model.learn(n_steps, self.callbacks, log_interval, reset_num_timesteps=not done)  # type: ignore[arg-type]
+            except KeyboardInterrupt:
+                print(f"Interrupted at {model.num_timesteps} steps.")
+                self._interrupted = True
+            except DivergedError as error:
+                last = next(iter(checkpoints(Path(self.save_path))), None)
+                raise DivergedError(f"{error} The last checkpoint: {last or 'none yet'}.") from None
+            finally:
+                stopping = self._checkpointing is not None and self._checkpointing.stopping
+                self._interrupted |= stopping and model.num_timesteps < self.n_timesteps
+                if checkpoints(Path(self.save_path)) and (stopping or model.num_timesteps < self.n_timesteps):
+                    print(f"To go on: {self._to_go_on()}")
+                assert model.env is not None
+                with contextlib.suppress(EOFError, ConnectionError):  # of envs in processes that have died
+                    model.env.close()
+            # The last model is still to be written
+            on_failure.pop_all()
+
+    def _to_go_on(self) -> str:
+        packages = self.args.gym_packages
+        record = read_record(Path(self.save_path) / RECORD)
+        trust = self.trust
+        try:
+            check_arguments(given_arguments(record["arguments"]), record["gym_packages"], RECORD, trust, packages)
+            plain_settings(self._given, RECORD, trust, packages)
+        except ValueError:  # what a user may say, the record may not
+            trust = True
+        return command_to_go_on(Path(self.save_path), record, trust)
+
+    def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+        if self.trust:
+            return super()._load_pretrained_agent(hyperparams, env)
+        print("Loading pretrained agent")
+        given = {key: value for key, value in hyperparams.items() if key not in ("policy", "policy_kwargs")}
+        logged = {"seed": self.seed, "tensorboard_log": self.tensorboard_log, "verbose": self.verbose}
+        model = self.method.algorithm.load_to_train(self.trained_agent, env, self.device, **given, **logged)
+        replay_buffer = Path(self.trained_agent).with_name("replay_buffer.pkl")
+        if replay_buffer.exists():
+            print("Loading replay buffer")
+            model.load_replay_buffer(replay_buffer)
+        return model
+
+    def save_trained_model(self, model: BaseAlgorithm) -> None:
+        """
+        :param model: at the end of its training
+        :raises OSError: if it cannot be written
+        :raises KeyboardInterrupt: when it is written, if the training was interrupted: a script should not go on
+        """
+        try:
+            # As rl_zoo3 does, but that of an id with a dot, what is behind it is no suffix
+            model.save(f"{self.save_path}/{self.env_name}.zip")
+            if self.save_replay_buffer and hasattr(model, "save_replay_buffer"):
+                model.save_replay_buffer(Path(self.save_path, "replay_buffer.pkl"))
+        except WRITE_ERRORS as error:
+            again = f"`{self._to_go_on()}` goes on from the last checkpoint"
+            if not checkpoints(Path(self.save_path)):
+                again = "train again, as there is no checkpoint either"
+            raise OSError(
+                f"The last model could not be written to {self.save_path} ({reason(error)}): mend that, and {again}."
+            ) from error
+        finally:
+            assert self._lock is not None
+            self._lock.release()
+        if self._interrupted:
+            raise KeyboardInterrupt
+
+    def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
+        # As used: -n may have replaced the file's
+        used = {**saved_hyperparams, "n_timesteps": self.n_timesteps}
+        if self.resumed is not None:
+            record = read_record(self.resumed / RECORD)
+            n_steps = self._checkpoint["model"]["counters"]["num_timesteps"]
+            going_on = record_going_on(record, self.resumed, used, sys.argv[1:], self._hardware(), n_steps)
+            self._going_on = going_on if going_on != record else None
+            return
+        super()._save_config(saved_hyperparams)
+        run = {
+            "env_id": self.env_name.gym_id,
+            "method": self.method.name,
+            "env_kwargs": self.env_kwargs,
+            "gym_packages": self.args.gym_packages,
+            "seed": self.seed,
+            "n_timesteps": self.n_timesteps,
+            "command": " ".join(sys.argv),
+            "arguments": sys.argv[1:],
+            "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+            "hardware": [self._hardware()],
+            **made_by(),
+            "hyperparams": used,
+        }
+        write_record(Path(self.save_path), run)
+
+    def _hardware(self) -> str:
+        return hardware(get_device(self.device))
