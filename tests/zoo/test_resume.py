@@ -451,7 +451,7 @@ def test_a_run_that_may_not_go_on_has_the_plan_that_it_had(
     run = run_folder(tmp_path)
     shutil.copytree(unbroken, run)
     with monkeypatch.context() as context:
-        context.setattr("sb3_htr.zoo.run.manager.CheckpointCallback.restore", refuse)
+        context.setattr("sb3_htr.zoo.run.training_manager.CheckpointCallback.restore", refuse)
         with pytest.raises(ValueError, match="other rewards"):
             main(["train", "--resume", str(run), "-n", "240"])
     assert json.loads((run / "run.json").read_text()) == json.loads((unbroken / "run.json").read_text())
