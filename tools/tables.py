@@ -1,14 +1,19 @@
 """Writes the result tables of the documents from ``results/*/summary.json``: ``python tools/tables.py``."""
 
 import json
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.markdown import markdown_table
+from sb3_htr.experiments.cell import file_name
 from sb3_htr.experiments.protocol import MIN_RUNS
 from sb3_htr.experiments.table import numbers, place, table
+from sb3_htr.zoo.plots.intervals import iqm_interval
 from sb3_htr.zoo.run.method import OWN
 
 RESULTS = Path(__file__).parents[1] / "results"
@@ -20,6 +25,7 @@ HEADLINES: dict[str, dict[str, tuple[str, ...]]] = {
         "point_robot": ("htr-ser", "pearl-dense", "pearl-sparse"),
         "wheeled": ("htr-ser", "pearl-dense", "pearl-sparse"),
         "ant": ("htr-ser", "pearl-dense"),
+        "target_speed": ("htr-ser", "pearl-dense", "pearl-sparse"),
         "fetch_reach": ("htr-ser", "pearl-sparse"),
         "fetch_push": ("htr-ser", "pearl-sparse"),
         "point_maze": ("htr-ser",),
@@ -36,6 +42,7 @@ COMPARED: dict[str, dict[str, tuple[str, ...]]] = {
         "point_robot": ("pearl-sparse", "pearl-dense"),
         "wheeled": ("pearl-sparse", "pearl-dense"),
         "ant": ("pearl-dense",),
+        "target_speed": ("pearl-sparse", "pearl-dense"),
         "fetch_reach": ("pearl-sparse",),
         "fetch_push": ("pearl-sparse",),
         "prior": ("pearl-dense-prior",),
@@ -50,29 +57,45 @@ COMPARED: dict[str, dict[str, tuple[str, ...]]] = {
         "ant": ("htr-hipi", "htr-hfr", "rl2", "sac-her"),
     },
 }
-EXPLORERS = {
-    "belief": {"last_episode_return": "return", "success_rate": "tasks solved", "episodes_to_first_success": "first success"},
-    "prior": {"last_episode_return": "return", "success_rate": "tasks solved"},
-}
+# Adaptation episodes, of 20, after which the tasks that are solved are shown
+EARLY = (1, 2, 5)
 
 
-def headline(summaries: dict[str, dict[str, Any]], methods_of: dict[str, tuple[str, ...]]) -> str:
+def headline(summaries: dict[str, dict[str, Any]], methods_of: dict[str, tuple[str, ...]], results: Path = RESULTS) -> str:
     """
     :param summaries: contents of ``summary.json`` by their names
     :param methods_of: what is shown of them, where they are there
+    :param results: folder of the raw data of each
     :return: Markdown table, one line per env and method
     """
-    shown = [(explorer, metric) for explorer, metrics in EXPLORERS.items() for metric in metrics]
-    heads = [f"`{explorer}`: {EXPLORERS[explorer][metric]}" for explorer, metric in shown]
+    shown = [(explorer, metric) for explorer in ("belief", "prior") for metric in ("last_episode_return", "success_rate")]
+    early = [f"episode {episode}" for episode in EARLY]
+    heads = ["`belief`: return", f"solved in {early[0]}", *early[1:], "episode 20", "worst run", "`prior`: return", "solved"]
     lines: list[list[str]] = []
     for name, methods in methods_of.items():
         scores: dict[tuple[str, ...], dict[tuple[str, str], str]] = {}
         for row in summaries.get(name, {"rows": []})["rows"]:
             if row["variant"] in methods and not row.get("tested_on") and (row["explorer"], row["metric"]) in shown:
-                key = (row["env"], f"{row['env_steps']:,}", str(row["n_seeds"]), row["variant"])
+                key = (row["env"], f"{row['env_steps']:,}", str(row["n_seeds"]), row["variant"], row["method"])
                 scores.setdefault(key, {})[row["explorer"], row["metric"]] = _interval(row)
-        lines += [[*key, *(cells.get(column, "") for column in shown)] for key, cells in scores.items()]
+        for (env, n_steps, n_runs, variant, method), cells in scores.items():
+            returned, solved, *by_prior = (cells.get(column, "") for column in shown)
+            shares = solved_by_episode(results / name / f"raw-{method}.npz", variant, "belief")
+            begin = [f"{iqm_interval(shares[:, episode - 1])[0]:.0%}" for episode in EARLY]
+            lines.append([env, n_steps, n_runs, variant, returned, *begin, solved, f"{shares[:, -1].min():.0%}", *by_prior])
     return markdown_table(["env", "env steps", "runs", "method", *heads], lines) + "\n"
+
+
+def solved_by_episode(file: Path, variant: str, explorer: str) -> np.ndarray:
+    """
+    :param file: raw data of runs
+    :param variant: whose runs
+    :param explorer: by which they adapted
+    :return: (n_runs, n_episodes), of the test tasks, which share each run solves in each adaptation episode
+    """
+    own = re.compile(rf"{re.escape(file_name(variant))}-seed\d+/successes_{explorer}")
+    with np.load(file) as raw:
+        return np.stack([raw[name].mean(axis=(0, 1)) for name in raw.files if own.fullmatch(name)])
 
 
 def rivals(summary: dict[str, Any]) -> str:
@@ -128,12 +151,12 @@ def differences(summaries: dict[str, dict[str, Any]], methods_of: dict[str, tupl
 
 
 def _times(row: dict[str, Any]) -> str:
-    """How many times as many; runs that never solved enough have no upper limit."""
+    """How many times as many. Runs that never solved enough count as if with one more evaluation, and have no upper limit."""
     if row["low"] is None:
         return ""
-    return (
-        f"{row['iqm']:.1f} [{row['low']:.1f}, {row['high']:.1f}]" if row["high"] is not None else f"at least {row['low']:.1f}"
-    )
+    if row["high"] is not None:
+        return f"{row['iqm']:.1f} [{row['low']:.1f}, {row['high']:.1f}]"
+    return f"≥ {row['iqm']:.1f} [{row['low']:.1f}, ∞), {row['n_unsolved']} of {row['n_seeds']} never"
 
 
 def _interval(row: dict[str, Any]) -> str:
