@@ -1,5 +1,7 @@
 """Which z is acted with: the promises of the explorers."""
 
+import itertools
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,8 +15,12 @@ from helpers.adaptations import begin, know_tasks, play, step, walk
 from sb3_htr import PEARL
 from sb3_htr.adaptation import Aggregate, Belief, LearnedPrior
 from sb3_htr.adaptation.explorers import Explorer
+from sb3_htr.adaptation.loop import adaptation_steps
+from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.type_aliases import Context
+from sb3_htr.common.vec_env import make_task_vec_env, reset_to_tasks
 from sb3_htr.experiments.ablations import ABLATIONS
+from sb3_htr.zoo.run.agents import agent_for
 
 SETBACKS = Aggregate().max_setbacks
 
@@ -30,6 +36,27 @@ def test_the_given_explorer_is_settings_and_each_adaptation_has_its_own(tiny_pea
     play(other, [[5, 5], [1, 0]])
     np.testing.assert_array_equal(play(ours, [[0, 0], [0, 5], [0, 4], [3, 4]]), alone)
     assert ours.explorer is not model.explorer is not other.explorer and vars(model.explorer) == before
+
+
+@pytest.mark.parametrize("explorer", ["prior", "aggregate", "belief", "learned-prior"])
+def test_an_adaptation_goes_on_from_its_recorded_steps(explorer: str, tmp_path: Path) -> None:
+    """As docs/real_robot.md says of a process that has ended."""
+    model = agent_for(ENV_ID, str(tmp_path)).load()
+    assert isinstance(model, PEARL)
+    env = make_task_vec_env(ENV_ID, 2, seed=0)
+    obs = reset_to_tasks(env, get_task_family(env).test_tasks[[3, 60]])
+    ours = model.start_adaptation(2, explorer, th.Generator().manual_seed(1))
+    steps = adaptation_steps(env, ours, 8, model.policy.unscale_action, ours.act, obs)
+    recorded = list(itertools.islice(steps, 7 * 20 + 9))
+    assert ours.n_episodes.tolist() == [7, 7] and (explorer != "belief" or (ours.best_return > 0).all())
+    again = model.start_adaptation(2, explorer, th.Generator().manual_seed(1))
+    for each in recorded:
+        np.testing.assert_array_equal(again.act(each.observations), each.actions)
+        again.observe(each)
+    np.testing.assert_array_equal(again.exploring(), ours.exploring())
+    now = recorded[-1].next_observations
+    np.testing.assert_array_equal(again.act(now), ours.act(now))
+    np.testing.assert_array_equal(again.explorer.final_z(), ours.explorer.final_z())
 
 
 @pytest.fixture(scope="module")

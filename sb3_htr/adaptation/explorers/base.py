@@ -76,8 +76,8 @@ class Explorer(ABC):
     @abstractmethod
     def exploring(self) -> np.ndarray:
         """
-        :return: (n_envs,) bool, whether it still explores: until the first reward with ``belief`` and ``aggregate``, for
-            ``n_exploration_episodes`` episodes with ``prior`` and ``learned-prior``
+        :return: (n_envs,) bool, whether it still explores: until the end of the first rewarded episode with ``belief`` and
+            ``aggregate``, for ``n_exploration_episodes`` episodes with ``prior`` and ``learned-prior``
         """
 
     def deviation(self) -> np.ndarray:

@@ -20,8 +20,8 @@ The search space is that of the method's algorithm, in sb3_htr/zoo/run/search_sp
 the YAML file. What -params names stays as given, and is not searched.
 
 examples:
-  sb3-htr optimize --env SparsePointRobot-v0 -n 40000 --n-trials 20
-  sb3-htr optimize --env SparsePointRobot-v0 -n 40000 --study-name htr --storage sqlite:///study.db --max-total-trials 50
+  sb3-htr optimize --env SparsePointRobot-v0 -n 60000 --n-trials 20
+  sb3-htr optimize --env SparsePointRobot-v0 -n 60000 --study-name htr --storage sqlite:///study.db --max-total-trials 50
   sb3-htr optimize ... -params gradient_steps:200 "policy_kwargs:{'net_arch':[64,64]}"
   sb3-htr optimize ... --method rl2 -n 400000
   sb3-htr optimize ... --study-name htr --storage postgresql+psycopg://user:password@host/database
