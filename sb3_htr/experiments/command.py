@@ -12,6 +12,7 @@ from sb3_htr.experiments import driver, executors, grid, raw_results, report
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.storage import storage_at
 from sb3_htr.zoo.commands.arguments import OF_PACKAGES, make_parser
+from sb3_htr.zoo.run.soft_interrupt import terminated_as_interrupted
 from sb3_htr.zoo.run.trust import import_packages
 
 EXAMPLE = """  sb3-htr experiment point_robot --jobs 2
@@ -57,7 +58,8 @@ def main(argv: Sequence[str]) -> None:
     if not args.finished:
         on_this_machine = executors.SerialExecutor() if args.cell is not None else executors.Processes(args.jobs)
         try:
-            driver.Driver(chosen, runs, executors.Ray(args.ray, args.device) if args.ray else on_this_machine).run()
+            with terminated_as_interrupted():
+                driver.Driver(chosen, runs, executors.Ray(args.ray, args.device) if args.ray else on_this_machine).run()
         except KeyboardInterrupt:
             print(f"\nStopped. What ran goes on from its checkpoint in {storage} with the same command.", file=sys.stderr)
             raise SystemExit(130) from None

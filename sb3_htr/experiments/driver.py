@@ -49,7 +49,7 @@ class Driver:
                         self._futures[self.executor.submit(*self.runs.call(cell))] = cell
                 self._wait()
         except BaseException:
-            # Ctrl-C reaches what runs on this machine, too: it stops before its next rollout, with a checkpoint
+            # What runs on this machine stops before its next rollout, with a checkpoint
             self.executor.shutdown(wait=True, cancel_futures=True)
             raise
         self.executor.shutdown()
@@ -60,8 +60,8 @@ class Driver:
         if self.failed:
             reasons = " ".join(f"{name}: {reason}" for name, reason in self.failed.items())
             raise ValueError(
-                f"{len(self.failed)} of {len(self.cells)} cells failed {ATTEMPTS} times (see log.txt in {self.runs}; "
-                f"the same command tries them again). {reasons}"
+                f"{len(self.failed)} of {len(self.cells)} cells failed (see log.txt in {self.runs}; the same command tries "
+                f"them again). {reasons}"
             )
 
     def todo(self) -> list[Cell]:
@@ -116,8 +116,9 @@ class Driver:
         if isinstance(error, Exception):
             # Ray's text is a traceback, with the error at its end
             self._fail(cell, f"{type(error).__name__}: {error}".strip().splitlines()[-1])
-        elif error is not None:
-            raise error
+        elif error is not None:  # of this process alone: it, or a callback of its training, was told to stop
+            print(f"{cell.label} was interrupted, and is left where it is.", file=sys.stderr, flush=True)
+            self.failed[cell.label] = "it was interrupted"
         elif future.result() and not self.runs.is_finished(cell):
             self._fail(cell, f"its node has a result that is not in {self.runs} here: give --runs that all nodes see.")
 
@@ -128,4 +129,4 @@ class Driver:
         what = f"failed {ATTEMPTS} times" if given_up else "failed, and is tried again"
         print(f"{cell.label} {what} at {at[1]:,} env steps: {reason}", file=sys.stderr, flush=True)
         if given_up:
-            self.failed[cell.label] = reason
+            self.failed[cell.label] = f"{what}: {reason}"

@@ -1,10 +1,13 @@
-"""Where cells run. An executor is a ``concurrent.futures.Executor``, so those of Dask, MPI or submitit fit, too."""
+"""Where cells run. An executor is a ``concurrent.futures.Executor`` that gives each call a process with one thread."""
 
 import os
+import signal
 import socket
+import time
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
-from multiprocessing import get_context, parent_process
+from contextlib import suppress
+from multiprocessing import active_children, get_context, parent_process
 from threading import Thread
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
@@ -12,6 +15,8 @@ from urllib.parse import urlsplit
 T = TypeVar("T")
 # Of a GPU, for a run: five were trained side by side on one, docs/performance.md
 GPU_SHARE = 0.2
+# Seconds: a node on which calls fail sooner, as where a disk is full, is kept busy so long, or it would take the whole queue
+FAST = 60.0
 
 
 class SerialExecutor(Executor):
@@ -41,9 +46,30 @@ class Processes(ThreadPoolExecutor):
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
         return super().submit(_in_a_process, fn, *args, **kwargs)
 
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """
+        :param wait: for what runs
+        :param cancel_futures: end what runs, too: it has the same interrupt as this process, and stops with a checkpoint
+        """
+        super().shutdown(wait=False, cancel_futures=cancel_futures)
+        while cancel_futures:
+            for child in active_children():
+                with suppress(ProcessLookupError):
+                    os.kill(child.pid or 0, signal.SIGINT)
+            try:
+                return super().shutdown(wait)
+            except KeyboardInterrupt:  # a second one: at once
+                continue
+        super().shutdown(wait)
 
-def _end_with_parent() -> None:
-    """End this process when its parent was killed: the next driver lets its cell go on from a checkpoint."""
+
+def _begin_in_a_process() -> None:
+    """
+    The terminal's Ctrl-C is for the driver, which hands it on once. End this process when that one was killed: the next driver
+    lets its cell go on from a checkpoint.
+    """
+    if os.name == "posix":
+        os.setpgrp()
 
     def watch() -> None:
         parent = parent_process()
@@ -55,7 +81,7 @@ def _end_with_parent() -> None:
 
 
 def _in_a_process(fn: Callable[..., T], *args: Any, **kwargs: Any) -> T:
-    with ProcessPoolExecutor(1, get_context("spawn"), initializer=_end_with_parent) as process:
+    with ProcessPoolExecutor(1, get_context("spawn"), initializer=_begin_in_a_process) as process:
         return process.submit(fn, *args, **kwargs).result()
 
 
@@ -104,4 +130,9 @@ class Ray(Executor):
 
 
 def _call(fn: Callable[..., T], *args: Any, **kwargs: Any) -> T:
-    return fn(*args, **kwargs)
+    start = time.monotonic()
+    try:
+        return fn(*args, **kwargs)
+    except Exception:
+        time.sleep(max(FAST - (time.monotonic() - start), 0))
+        raise

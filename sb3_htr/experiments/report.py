@@ -151,18 +151,16 @@ def _rounded(interval: tuple[float, float, float]) -> dict[str, float]:
 def check(results: dict[Cell, Path]) -> None:
     """
     :param results: raw results of cells
-    :raises ValueError: if one is damaged, of something else, or lacks something, as those of older versions do; or if runs of
-        one variant were trained with different hyperparameters
+    :raises ValueError: if one is damaged, of something else, lacks something, as those of older versions do, or was trained
+        with other hyperparameters than its cell would be
     """
-    trained_by: dict[tuple[str, str], tuple[Path, dict[str, Any]]] = {}
     for cell, path in results.items():
         # Older ones do not say
         own = json.loads(str(raw_results.load(cell, path).get("hyperparams", "null")))
-        first, theirs = trained_by.setdefault((cell.variant, str(cell.env_kwargs)), (path, own))
-        if own and theirs and (different := raw_results.differing(own, theirs)):
+        if own and (different := raw_results.differing(own, hyperparams_of(cell))):
             raise ValueError(
-                f"{path} was trained with other {different} than {first}: has a YAML file changed in between? Move one of the "
-                "two away with its run, or choose other --runs."
+                f"{path} was trained with other {different} than {cell.label} would be: has a YAML file changed in between? "
+                "Restore it, move this file away with its run, or choose other --runs."
             )
 
 

@@ -1,5 +1,6 @@
 """Each cell of a grid gets one result, whoever runs it and whatever fails on the way."""
 
+import errno
 import os
 import re
 import signal
@@ -9,7 +10,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +102,7 @@ def test_failures_are_tried_again_from_where_they_were_and_reported(
             raise OSError("out of memory")
 
     trained = trains(work)
-    with pytest.raises(ValueError, match=r"1 of 6 cells failed 3 times .*/htr-ser-seed1: RuntimeError: no luck"):
+    with pytest.raises(ValueError, match=r"1 of 6 cells failed .*/htr-ser-seed1: failed 3 times: RuntimeError: no luck"):
         Driver(CELLS, tmp_path, SerialExecutor()).run()
     assert trained.count(hopeless.name) == ATTEMPTS and trained.count(slow.name) == 2 * ATTEMPTS + 1 and len(set(trained)) == 6
     out, err = capsys.readouterr()
@@ -179,6 +180,44 @@ def test_a_killed_worker_process_takes_no_other_with_it() -> None:
     with Processes(2) as executor:
         killed, other = executor.submit(os._exit, 9), executor.submit(os.getpid)
         assert other.result() != os.getpid() and "terminated abruptly" in str(killed.exception())
+
+
+def test_who_stops_stops_what_runs_too() -> None:
+    """Of a driver that is interrupted alone, as by a scheduler; what did not begin yet never does."""
+    executor = Processes(2)
+    futures = [executor.submit(time.sleep, 100) for _ in range(3)]
+    while len(active_children()) < 2:
+        time.sleep(0.01)
+    start = time.monotonic()
+    executor.shutdown(cancel_futures=True)
+    assert time.monotonic() - start < 50 and all(future.done() for future in futures) and futures[2].cancelled()
+
+
+def test_one_that_is_interrupted_alone_ends_no_other(trains: Any, tmp_path: Path) -> None:
+    def train(cell: Cell, folder: Path) -> None:
+        if cell == CELLS[1]:
+            raise KeyboardInterrupt
+
+    trained = trains(train)
+    with pytest.raises(ValueError, match=r"1 of 6 cells failed .*: it was interrupted"):
+        Driver(CELLS, tmp_path, ThreadPoolExecutor(1)).run()
+    assert len(trained) == 6
+
+
+def test_what_a_server_does_not_answer_is_asked_again(trains: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    errors = [OSError(errno.ESTALE, "Stale file handle"), None, OSError(errno.EIO, "Input/output error")]
+    listdir = os.listdir
+
+    def sometimes(folder: Any) -> list[str]:
+        error = errors.pop(0) if errors else None
+        if error is not None:
+            raise error
+        return listdir(folder)
+
+    monkeypatch.setattr("sb3_htr.experiments.storage.folder.os.listdir", sometimes)
+    trained = trains(lambda cell, folder: None)
+    Driver(CELLS, tmp_path, ThreadPoolExecutor(1)).run()
+    assert sorted(trained) == sorted(cell.name for cell in CELLS) and not errors
 
 
 def test_the_job_array_of_the_manual_runs_its_cell(tmp_path: Path) -> None:

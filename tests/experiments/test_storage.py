@@ -326,6 +326,22 @@ def test_one_that_was_taken_for_dead_sends_nothing(url: str, trains: Any) -> Non
     assert not store.is_finished(cell) and store.is_claimed(cell)
 
 
+def test_one_that_lost_its_cell_stops_at_once(url: str, trains: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(objects, "RENEW", 0.05)
+    (cell, *_), store = CELLS, ObjectStore(url)
+
+    def work(cell: Cell, folder: Path) -> None:
+        (path,) = store.files.find(f"{store.root}/{cell.experiment}/{cell.name}/.claims")
+        while not Claim(store.files, path.rpartition("/")[0]).take(void=store.files.cat_file(path)):
+            pass
+        for _ in range(1000):
+            time.sleep(0.1)
+
+    trains(work)
+    start = time.monotonic()
+    assert not objects.run_on_copy(cell, url) and time.monotonic() - start < 50
+
+
 def test_what_killed_processes_left_is_removed_and_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     with node_folder() as at_work, node_folder() as other:

@@ -32,6 +32,7 @@ from sb3_htr.zoo.run.method import PEARLMethod, get_method, merged, methods
 from sb3_htr.zoo.run.record import RECORD
 from sb3_htr.zoo.run.search_manager import SearchManager
 from sb3_htr.zoo.run.study import absolute, without_password
+from sb3_htr.zoo.run.training_manager import TrainingManager
 
 SMALL = ["-params", "n_tasks_per_rollout:4", "n_episodes_per_task:3", "learning_starts:240", "n_envs:4"]
 
@@ -167,6 +168,23 @@ def test_no_password_is_printed() -> None:
     for storage in ("logs/study.log", "sqlite:///study.db", "postgresql+psycopg://me@/x?host=/tmp/socket"):
         assert without_password(storage) == storage
     assert without_password("postgresql+psycopg://me:secret@db/x") == "postgresql+psycopg://me:***@db/x"
+
+
+def test_a_run_of_a_trial_keeps_no_password_and_goes_on_without_the_study(
+    quick: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    storage = "postgresql+psycopg://me:TOPSECRET@db/x"
+    command = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-n", "480", "--save-freq", "1", "--eval-freq", "-1"]
+    command += ["--verbose", "0", "--storage", storage, "--study-name", "x", "--trial-id", "3", *SMALL]
+    with monkeypatch.context() as patch:
+        patch.setattr("sb3_htr.zoo.run.training_manager.check_is_of", lambda *_: None)
+        patch.setattr(TrainingManager, "load_trial", lambda *_: {"gamma": 0.77})
+        assert main(command) == 0
+    run = run_folder(tmp_path)
+    texts = [path for path in run.rglob("*") if path.is_file() and b"TOPSECRET" in path.read_bytes()]
+    assert texts == [] and "me:***@db" in (run / RECORD).read_text()
+    assert main(["train", "--resume", str(run), "-n", "240"]) == 0
+    assert PEARL.load(run / f"{ENV_ID}.zip").gamma == 0.77
 
 
 def test_a_study_in_postgresql(postgresql: str, quick: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -302,14 +302,15 @@ def test_kills_at_random_moments_change_nothing(unbroken: Path, tmp_path: Path) 
     assert len(list((run / "checkpoints").iterdir())) == 2
 
 
-def test_an_interrupt_stops_with_a_checkpoint_and_says_how_to_go_on(unbroken: Path, tmp_path: Path) -> None:
-    """As a terminal sends it, to all processes of the command."""
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_stops_with_a_checkpoint_and_says_how_to_go_on(kind: int, unbroken: Path, tmp_path: Path) -> None:
+    """As a terminal sends it, and a scheduler, to all processes of the command."""
     command = [sys.executable, "-u", "-m", "sb3_htr.zoo.cli", *TRAIN, "-f", str(tmp_path)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True)
     run = run_folder(tmp_path)
     while process.poll() is None and not checkpoints(run):
         time.sleep(0.005)
-    os.killpg(process.pid, signal.SIGINT)
+    os.killpg(process.pid, kind)
     output = process.communicate(timeout=60)[0]
     assert process.returncode == 130, output
     assert f"sb3-htr train --resume {run}" in output

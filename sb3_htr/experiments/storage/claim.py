@@ -70,11 +70,17 @@ class Claim:
         newest = max(self._claims(), default=None)
         return newest == self._path and self._content_of(newest).startswith(self._token.encode())
 
-    def renew(self) -> None:
-        """Show that its owner lives."""
-        if self.is_ours():
-            self._count += 1
-            self.files.pipe_file(self._path, self._content())
+    def renew(self) -> bool:
+        """
+        Show that its owner lives.
+
+        :return: whether nobody took it over
+        """
+        if not self.is_ours():
+            return False
+        self._count += 1
+        self.files.pipe_file(self._path, self._content())
+        return True
 
     def release(self) -> None:
         """Leave it to whoever comes."""

@@ -1,7 +1,9 @@
 """Runs in a folder that all nodes see under one name, with the locks of its file system."""
 
 import os
+import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +22,8 @@ class SharedFolder:
     """
 
     def __init__(self, runs: Path) -> None:
-        self.runs = runs.resolve()
+        # As all nodes name it: where a link leads may be known here alone
+        self.runs = Path(os.path.abspath(runs))
         self._listed: dict[Path, set[str]] = {}
 
     def __str__(self) -> str:
@@ -32,8 +35,13 @@ class SharedFolder:
 
     def look(self, cells: Sequence[Cell]) -> None:
         """A listing is fresh where answers about single files may be remembered, as by NFS."""
-        folders = {cell.result(self.runs).parent for cell in cells}
-        self._listed |= {folder: set(os.listdir(folder)) if folder.exists() else set() for folder in folders}
+        for folder in {cell.result(self.runs).parent for cell in cells}:
+            try:
+                self._listed[folder] = set(os.listdir(folder))
+            except FileNotFoundError:
+                self._listed[folder] = set()
+            except OSError as error:  # a server that is out of reach for a while: what was seen before holds
+                print(f"{folder} could not be read: {error}", file=sys.stderr, flush=True)
 
     def is_finished(self, cell: Cell) -> bool:
         """Whether it has a result."""
@@ -46,13 +54,15 @@ class SharedFolder:
             return False
         try:
             lock_of(cell, self.runs).acquire(timeout=0).lock.release()
-        except Timeout:
+        except (Timeout, OSError):  # what cannot be asked cannot be begun either
             return True
         return False
 
     def n_steps(self, cell: Cell) -> int:
         """Env steps before its latest checkpoint."""
-        return max((n_steps_done(run) for run in cell.run_folder(self.runs).glob("*/*")), default=0)
+        with suppress(OSError):
+            return max((n_steps_done(run) for run in cell.run_folder(self.runs).glob("*/*")), default=0)
+        return 0
 
     def call(self, cell: Cell) -> tuple[Any, ...]:
         """See :func:`sb3_htr.experiments.runner.run_cell`."""

@@ -2,6 +2,7 @@
 
 import sys
 import time
+from _thread import interrupt_main
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property
@@ -183,16 +184,25 @@ def run_on_copy(cell: Cell, url: str, void: bytes | None = None) -> bool:
     """
     files, root = _opened(url)
     there, result = f"{root}/{_folder(cell)}", f"{root}/{_result(cell)}"
-    claim = Claim(files, f"{there}/{CLAIMS}")
+    claim, lost = Claim(files, f"{there}/{CLAIMS}"), Event()
+
+    def renew() -> None:
+        if not claim.renew() and not lost.is_set():
+            print(f"{cell.label} was taken over by another process: this one stops.", file=sys.stderr, flush=True)
+            lost.set()
+            interrupt_main()
+
     try:
         if not _patiently(lambda: claim.take(void)):
             return False
-        with _Every(RENEW, claim.renew), node_folder() as runs:
-            copy = WorkingCopy(files, there, cell.run_folder(runs), claim.is_ours)
-            _patiently(copy.fetch)
+        with _Every(RENEW, renew), node_folder() as runs:
             if _patiently(lambda: files.exists(result)):
+                # Another process was sooner
                 cell.result(runs).parent.mkdir(parents=True, exist_ok=True)
                 _patiently(lambda: files.get_file(result, str(cell.result(runs))))
+                return run_cell(cell, runs)
+            copy = WorkingCopy(files, there, cell.run_folder(runs), claim.is_ours)
+            _patiently(copy.fetch)
             try:
                 with _Every(SEND, copy.send):
                     has_result = run_cell(cell, runs)
@@ -208,6 +218,10 @@ def run_on_copy(cell: Cell, url: str, void: bytes | None = None) -> bool:
             # Its evaluations were kept until now
             _unless_it_fails(copy.prune)
             return has_result
+    except KeyboardInterrupt:
+        if lost.is_set():
+            return False
+        raise
     finally:
         _unless_it_fails(claim.release)
 

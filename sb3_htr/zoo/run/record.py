@@ -17,6 +17,8 @@ MAX_RECORD = 2**20
 # What it must say, and what it may say for training on and for model cards
 REQUIRED = {"env_id": str, "env_kwargs": dict, "gym_packages": list}
 OF_TRAINING = {"arguments": list, "n_timesteps": int, "seed": int, "method": str, "hyperparams": dict, "hardware": list}
+# Which it has if they were of a trial of a study: its hyperparameters
+TRIAL = "trial"
 
 
 def read_record(path: Path, content: bytes | None = None) -> dict[str, Any]:
@@ -32,7 +34,7 @@ def read_record(path: Path, content: bytes | None = None) -> dict[str, Any]:
         texts = *record["gym_packages"], *record.get("arguments", ()), *record.get("hardware", ())
         code = record, *record.get("resumed_by", ())
         kinds_are_right = all(type(record[name]) is kind for name, kind in {**REQUIRED, **given}.items())
-        kinds_are_right &= all(type(by.get("versions", {})) is dict for by in code)
+        kinds_are_right &= all(type(by.get("versions", {})) is dict for by in code) and type(record.get(TRIAL, {})) is dict
         if kinds_are_right and all(isinstance(text, str) for text in texts):
             return cast(dict[str, Any], record)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):

@@ -1,4 +1,4 @@
-"""Ctrl-C during a training."""
+"""Ctrl-C during a training, and what a scheduler sends before it kills."""
 
 import contextlib
 import signal
@@ -11,18 +11,35 @@ from sb3_htr.common.checkpoint_callback import CheckpointCallback
 
 @contextlib.contextmanager
 def soft_interrupt(checkpointing: CheckpointCallback | None) -> Iterator[None]:
-    """Let the first Ctrl-C end the training before the next rollout, with a checkpoint, and the second one at once."""
+    """Let the first Ctrl-C or SIGTERM end the training before the next rollout, with a checkpoint, the second one at once."""
     if checkpointing is None or threading.current_thread() is not threading.main_thread():
         yield
         return
 
     def stop(signum: int, frame: Any) -> None:
-        signal.signal(signal.SIGINT, before)
+        restore()
         print("Stopping after this rollout, with a checkpoint. Press Ctrl-C again to stop at once.")
         checkpointing.stop()
 
-    before = signal.signal(signal.SIGINT, stop)
+    def restore() -> None:
+        for signal_, handler in before.items():
+            signal.signal(signal_, handler)
+
+    before = {signal_: signal.signal(signal_, stop) for signal_ in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        restore()
+
+
+@contextlib.contextmanager
+def terminated_as_interrupted() -> Iterator[None]:
+    """Let SIGTERM, which schedulers send before they kill, be as Ctrl-C."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

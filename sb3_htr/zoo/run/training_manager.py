@@ -21,9 +21,9 @@ from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.zoo.run.callbacks import ProgressCallback
 from sb3_htr.zoo.run.folder import SystemLock, claim, lock
 from sb3_htr.zoo.run.manager import MetaExperimentManager
-from sb3_htr.zoo.run.record import RECORD, command_to_go_on, read_record, record_going_on, write_record
+from sb3_htr.zoo.run.record import RECORD, TRIAL, command_to_go_on, read_record, record_going_on, write_record
 from sb3_htr.zoo.run.soft_interrupt import soft_interrupt
-from sb3_htr.zoo.run.study import check_is_of, check_is_there
+from sb3_htr.zoo.run.study import check_is_of, check_is_there, without_password
 from sb3_htr.zoo.run.train_arguments import given_arguments
 from sb3_htr.zoo.run.trust import check_arguments, plain_settings
 
@@ -38,9 +38,14 @@ class TrainingManager(MetaExperimentManager):
         # The record of a run that goes on otherwise than it was begun
         self._going_on: dict[str, Any] | None = None
         self._lock: SystemLock | None = None
+        self._trial: dict[str, Any] = {}
         self._interrupted = False
 
     def _settings_of_trial(self, trial_id: int | None) -> dict[str, Any]:
+        if self.resumed is not None and TRIAL in (record := read_record(self.resumed / RECORD)):
+            # Its study may be gone
+            self._trial = dict(record[TRIAL])
+            return self._trial
         named = {"--storage": self.storage, "--study-name": self.study_name, "--trial-id": trial_id}
         missing = [option for option, value in named.items() if value is None]
         if len(missing) == 3:
@@ -52,13 +57,13 @@ class TrainingManager(MetaExperimentManager):
         check_is_there(self.storage)
         check_is_of(self.storage, self.study_name, {"env": self.env_name.gym_id, "method": self.method.name})
         try:
-            trial: dict[str, Any] = self.load_trial(self.storage, self.study_name, trial_id)
+            self._trial = self.load_trial(self.storage, self.study_name, trial_id)
         except (KeyError, IndexError):
             raise ValueError(
                 f"{self.storage} has no study {self.study_name!r} with a trial {trial_id}: `sb3-htr optimize` prints both."
             ) from None
-        print(f"With those of trial {trial_id}: {trial}")
-        return trial
+        print(f"With those of trial {trial_id}: {self._trial}")
+        return self._trial
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         """
@@ -204,7 +209,10 @@ class TrainingManager(MetaExperimentManager):
             going_on = record_going_on(record, self.resumed, used, sys.argv[1:], self._hardware(), n_steps)
             self._going_on = going_on if going_on != record else None
             return
+        self.args.storage = None if self.storage is None else without_password(self.storage)
         super()._save_config(saved_hyperparams)
+        command = Path(self.params_path, "command.txt")
+        command.write_text(self._shown(command.read_text()))
         run = {
             "env_id": self.env_name.gym_id,
             "method": self.method.name,
@@ -212,14 +220,19 @@ class TrainingManager(MetaExperimentManager):
             "gym_packages": self.args.gym_packages,
             "seed": self.seed,
             "n_timesteps": self.n_timesteps,
-            "command": " ".join(sys.argv),
-            "arguments": sys.argv[1:],
+            "command": self._shown(" ".join(sys.argv)),
+            "arguments": [self._shown(argument) for argument in sys.argv[1:]],
+            **({TRIAL: self._trial} if self._trial else {}),
             "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
             "hardware": [self._hardware()],
             **made_by(),
             "hyperparams": used,
         }
         write_record(Path(self.save_path), run)
+
+    def _shown(self, text: str) -> str:
+        """Without the password of a database: files of a run are read by others."""
+        return text if self.storage is None else text.replace(self.storage, without_password(self.storage))
 
     def _hardware(self) -> str:
         return hardware(get_device(self.device))
