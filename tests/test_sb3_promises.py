@@ -243,7 +243,7 @@ def test_an_actor_of_ones_own_acts_and_learns() -> None:
 
     model = PEARL(Policy, ENV_ID, **TINY).learn(2 * ROLLOUT, look)
     assert (seen[0] < 0).any() and (seen[-1] > 0.9).all(), "random ones first"
-    assert model._n_updates > 0 and (model.adapt(ENV_ID, 1).predict(np.zeros(2, dtype=np.float32))[0] > 0.9).all()
+    assert model._n_updates > 0 and (model.adapt(ENV_ID, 1, task=0).predict(np.zeros(2, dtype=np.float32))[0] > 0.9).all()
 
 
 def test_an_actor_whose_own_part_would_not_be_asked_is_refused() -> None:

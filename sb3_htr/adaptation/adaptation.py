@@ -227,9 +227,12 @@ class Adaptation:
         """
         Take the running episodes of some envs into their posteriors.
 
-        :param envs: (k,) int
+        :param envs: (k,) int; of those whose episode has no step yet there is nothing to take in
         :param keep: what is in their posteriors already; if not, it is forgotten
         """
+        if not keep:
+            self._state[envs] = self.policy.encoder.empty(len(envs))
+        envs = envs[self._n_steps[envs] > 0]
         if len(envs) == 0:
             return
         n_steps = self._n_steps[envs]
@@ -237,9 +240,8 @@ class Adaptation:
         steps, lengths = evenly_spread(n_steps, self.context_size, task_reward[np.repeat(envs, n_steps), positions(n_steps)])
         at, device = (np.repeat(envs, lengths), steps), self.policy.device
         context = Context(*(th.as_tensor(array, device=device) for array in (*(column[at] for column in columns), lengths)))
-        before = self._state[envs] if keep else self.policy.encoder.empty(len(envs))
         with th.no_grad():
-            self._state[envs] = self.policy.extend_posterior(before, context)
+            self._state[envs] = self.policy.extend_posterior(self._state[envs], context)
 
     def posterior(self, envs: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """

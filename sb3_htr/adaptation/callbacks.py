@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_htr.adaptation.evaluation import MetaLearner, check_adapts, first_success, record_adaptation, task_set
 from sb3_htr.adaptation.explorers import to_explorer
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.common.checks import get_task_family
+from sb3_htr.common.checks import check_is_env, get_task_family
 from sb3_htr.common.errors import WRITE_ERRORS, reason
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
@@ -27,7 +27,8 @@ class MetaEvalCallback(EvalCallback):
     The score is the mean return of the last adaptation episode over the tasks. ``best_model.zip`` is chosen by it, on
     validation tasks by default, so that the test tasks stay unseen until the end. ``evaluations.npz`` has ``timesteps``
     (n,), ``results`` (n, n_tasks), the returns of the last episode, and ``returns`` and ``successes``
-    (n, n_tasks, n_eval_episodes). A training that ends before its first evaluation is evaluated at its end.
+    (n, n_tasks, n_eval_episodes). A training that ends before its first evaluation is evaluated at its end,
+    but not where another callback calls this one, as ``EveryNTimesteps`` does, which has to with ``eval_freq=1``.
 
     :param eval_env: env of the task family, VecEnv or registered id
     :param tasks: ``"validation"``, ``"test"``, ``"train"`` or task vectors (n_tasks, task_dim)
@@ -52,6 +53,7 @@ class MetaEvalCallback(EvalCallback):
             raise ValueError("An evaluation shows no window: leave render out, and watch a saved model with `sb3-htr enjoy`.")
         if isinstance(eval_env, str):
             eval_env = make_task_vec_env(eval_env, N_ENVS)
+        check_is_env(eval_env)
         super().__init__(eval_env, n_eval_episodes=n_eval_episodes, **kwargs)
         self.tasks = task_set(get_task_family(self.eval_env), tasks)
         if explorer is not None:

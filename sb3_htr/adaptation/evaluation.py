@@ -230,7 +230,8 @@ def evaluate_adaptation(
     """
     Adapt to each task from scratch and report every episode (the protocol of PEARL's reference implementation).
 
-    The context of a task's posterior comes from the episodes of this very adaptation and from nowhere else.
+    The context of a task's posterior comes from the episodes of this very adaptation and from nowhere else. The envs keep
+    their last task, as after :meth:`sb3_htr.PEARL.adapt`: ``set_task(None)`` has them draw one at each reset again.
 
     :param model: a PEARL, or a rival
     :param env: env, VecEnv (its envs adapt side by side, each to a task of its own) or registered id, of

@@ -103,7 +103,8 @@ class CheckpointCallback(BaseCallback):
         that has no ``state_dict``, each attribute that is a number
     :param name_prefix: for SB3's signature, not used
     :param verbose: 1 says where checkpoints are written
-    :raises ValueError: if none would be kept
+    :raises ValueError: if none would be kept; at the beginning of a training, if another callback calls it, as
+        ``EveryNTimesteps`` would
     """
 
     def __init__(
@@ -162,6 +163,13 @@ class CheckpointCallback(BaseCallback):
         return {path.name: path.stat().st_size for path in self.run.glob("*.monitor.csv")}
 
     def _on_training_start(self) -> None:
+        if self.parent is not None:
+            raise ValueError(
+                f"A CheckpointCallback within {type(self.parent).__name__} hears nothing of rollouts, between which it saves: "
+                "pass it beside that one, with its own save_freq."
+            )
+        if self._stopped:  # a training before this one
+            self.stopping = self._stopped = False
         if self._pending is not None:
             at = self._pending["model"]["counters"]["num_timesteps"]
             if self.num_timesteps != at:

@@ -32,6 +32,8 @@ def check_is_env(env: Any) -> None:
     :param env: that a user gave
     :raises ValueError: if SB3 cannot use it, for which SB3 has a sentence about another library
     """
+    if env is None:
+        raise ValueError("There is no env: pass one, or the id of one.")
     if isinstance(env, str):
         raise ValueError(f"The env is the id {env!r}, expected an env: make it with sb3_htr.make_task_vec_env(id, n_envs).")
     if isinstance(env, gym.vector.VectorEnv):

@@ -28,8 +28,6 @@ class MetaProgressBarCallback(ProgressBarCallback):
         self.pbar.smoothing = 0.05
         # A model that does not tell has SB3's bar
         self._listeners: list[Any] = getattr(self.model, "update_listeners", [])
-        # A training that was interrupted has left its bar there
-        self._listeners[:] = [one for one in self._listeners if not isinstance(getattr(one, "__self__", None), type(self))]
         self._listeners.append(self._on_update)
 
     def _on_rollout_start(self) -> None:

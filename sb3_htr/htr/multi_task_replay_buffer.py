@@ -198,7 +198,8 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         if (bad := (task < 0) | (task >= self.n_tasks)).any():
             raise ValueError(
                 f"info['task_id'] is {infos[int(bad.argmax())].get('task_id')}, expected a training task from 0 to "
-                f"{self.n_tasks - 1}: only training tasks may enter the replay buffer."
+                f"{self.n_tasks - 1}: only training tasks may enter the replay buffer. A callback that gives the envs of "
+                "training another one, as one that evaluates in them does, needs envs of its own."
             )
         if (bad := (step > 0) & (task != self._open_task)).any():
             i = int(bad.argmax())

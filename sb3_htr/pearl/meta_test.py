@@ -91,7 +91,7 @@ class MetaTest(SAC):
             of the best one that had a single z, or the one that promises most, where that found little of what there is; of
             ``"prior"``, a draw from the posterior over all of them
         :param task: index of a training task or task vector; by default the task that the env was given, or one that it draws.
-            The env keeps it. An env without task family takes none
+            The env keeps it. An env without task family takes none, and with an id one is needed
         :param explorer: an explorer, its name, or its name and settings; the model's own by default
         :param deterministic: adapt with mean actions instead of samples
         :param seed: seed of z, and of the actions if they are samples
@@ -101,6 +101,8 @@ class MetaTest(SAC):
         """
         check_numbers(n_episodes=(n_episodes, 1), seed=(seed, 0, MAX_SEED))
         vec_env = self._wrap_env(gym.make(env) if isinstance(env, str) else env, monitor_wrapper=False)
+        if isinstance(env, str) and task is None and vec_env.has_attr("task_family"):
+            raise ValueError(f"Which task of {env} the agent is for, nobody would know: pass task, or an env that has one.")
         if vec_env.num_envs != 1:
             raise ValueError(f"adapt() adapts to one task, but the VecEnv has {vec_env.num_envs} envs: pass a single env.")
         self.check_env(vec_env)

@@ -170,7 +170,7 @@ class OffPolicyMetaAlgorithm(MetaTest, ReplayFiles, CheckedFiles, SAC):
         settings = ("policy_kwargs", "replay_buffer_kwargs")
         vars(self).update({k: plain(v) for k, v in vars(self).items() if k in settings or isinstance(v, np.generic)})
         # Without an env, which is for files alone, the settings come from there
-        max_episode_steps = n_envs = 1
+        max_episode_steps, n_envs = self.max_episode_steps or 1, 1
         check_numbers(n_tasks_per_rollout=(self.n_tasks_per_rollout, 1))
         self.seed = checked_seed(self.seed)
         self.replay_buffer_class = buffer_class = self.replay_buffer_class or MultiTaskReplayBuffer
@@ -185,6 +185,8 @@ class OffPolicyMetaAlgorithm(MetaTest, ReplayFiles, CheckedFiles, SAC):
             max_episode_steps, n_envs = checks.get_max_episode_steps(self.env), self.env.num_envs
         # All envs are stepped, as often as it takes
         n_tasks = -(-self.n_tasks_per_rollout // n_envs) * n_envs
+        if self.env is None:
+            n_tasks = self.n_rollout_tasks or n_tasks
         given = {name: getattr(self, name) for name in BY_HORIZON}
         vars(self).update(complete(given, max_episode_steps, n_tasks))
         if self.env is not None:
@@ -356,6 +358,10 @@ class OffPolicyMetaAlgorithm(MetaTest, ReplayFiles, CheckedFiles, SAC):
             )
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        # A training that was interrupted has left its bar there
+        bars = [one for one in self.update_listeners if isinstance(getattr(one, "__self__", None), MetaProgressBarCallback)]
+        for bar in bars:
+            self.update_listeners.remove(bar)
         return super()._init_callback(followed_by(callback, MetaProgressBarCallback()) if progress_bar else callback)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:

@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_htr.adaptation import explorers
-from sb3_htr.common.checks import check_recorded_spaces, check_spaces
+from sb3_htr.common.checks import check_is_env, check_recorded_spaces, check_spaces
 from sb3_htr.common.errors import OPEN_ERRORS, last_line
 from sb3_htr.common.safe_load import Refused, read_model
 from sb3_htr.common.saving import with_suffix
@@ -55,13 +55,15 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
     anew.
 
     :param path: file of ``PEARL.save``
-    :param env: env of the same spaces, which are compared with what the file says of them in words
+    :param env: env of a task family, as for a training, of the same spaces, which are compared with what the file says of
+        them in words
     :param device: torch device
     :param kwargs: arguments of PEARL, in place of those of the file
     :return: a model to predict, adapt and evaluate with
     :raises OSError: if there is no such file, or it cannot be opened
     :raises ValueError: if it is no such file, or its weights or spaces do not fit
     """
+    PEARL.check_names(kwargs)
     # As SB3's load does
     path = path if os.path.exists(path) else with_suffix(path, ".zip")
     try:
@@ -95,6 +97,7 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
         raise ValueError(f"{path} is damaged, or no model saved by PEARL: nothing of it was loaded.") from None
     if isinstance(env, str):
         env = make_task_vec_env(env)
+    check_is_env(env)
     for name in ("policy_kwargs", "replay_buffer_kwargs"):
         kwargs[name] = {**settings.pop(name), **(kwargs.get(name) or {})}
     _check_shapes(path, weights["policy"], env, kwargs["policy_kwargs"])

@@ -17,6 +17,7 @@ from htr_envs import DynamicsVectorEnv, PointRobotFamily
 from htr_envs.point_robot import PointRobotDynamics
 from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.adaptation import Adaptation, Belief, Prior, Step, evaluation
+from sb3_htr.adaptation.callbacks import MetaEvalCallback
 from sb3_htr.adaptation.evaluation import record_adaptation
 from sb3_htr.common.random_state import get_env_states
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env, reset_to_tasks
@@ -226,9 +227,12 @@ def test_adapt_keeps_one_task_when_the_env_has_none(tiny_pearl: MakePEARL) -> No
         (lambda m: m.adapt(ENV_ID, n_episodes=0), "n_episodes is 0, expected a whole number of at least 1"),
         (lambda m: m.adapt(make_task_vec_env(ENV_ID, 2)), "the VecEnv has 2 envs"),
         (lambda m: m.adapt(ENV_ID, task=80), "80"),
-        (lambda m: m.adapt(ENV_ID, explorer="x"), "explorer is 'x', expected one of"),
-        (lambda m: m.adapt(ENV_ID, explorer={"name": "prior", "scale": 1}), "explorer 'prior' has no setting 'scale'"),
+        (lambda m: m.adapt(ENV_ID), "Which task of SparsePointRobot-v0 the agent is for, nobody would know: pass task"),
+        (lambda m: m.adapt(ENV_ID, task=0, explorer="x"), "explorer is 'x', expected one of"),
+        (lambda m: m.adapt(ENV_ID, task=0, explorer={"name": "prior", "scale": 1}), "explorer 'prior' has no setting 'scale'"),
         (lambda m: evaluate_adaptation(m, gym.make_vec(ENV_ID, 2)), "VectorEnv"),  # type: ignore[arg-type]
+        (lambda m: evaluate_adaptation(m, None), "There is no env: pass one"),  # type: ignore[arg-type]
+        (lambda m: MetaEvalCallback(gym.make_vec(ENV_ID, 2)), "VectorEnv"),
         (lambda m: evaluate_adaptation(m, ENV_ID, explorer=3), "explorer is 3, expected one of"),
         (lambda m: evaluate_adaptation(m, ENV_ID, n_episodes=0), "n_episodes is 0"),
         (lambda m: evaluate_adaptation(m, ENV_ID, np.zeros((0, 2))), "at least one task"),

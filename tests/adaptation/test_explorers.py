@@ -59,6 +59,19 @@ def test_an_adaptation_goes_on_from_its_recorded_steps(explorer: str, tmp_path: 
     np.testing.assert_array_equal(again.explorer.final_z(), ours.explorer.final_z())
 
 
+def test_where_nothing_happened_yet_there_is_nothing_to_infer(tiny_pearl: MakePEARL) -> None:
+    adaptation = begin(tiny_pearl(), "prior", 2)
+    adaptation.infer(np.arange(2), keep=True)
+    unknown = adaptation.posterior()
+    play(adaptation, [[1.0, 2.0]])
+    known = adaptation.posterior()
+    adaptation.infer(np.arange(2), keep=True)
+    np.testing.assert_array_equal(adaptation.posterior(), known)
+    adaptation.infer(np.arange(2), keep=False)
+    np.testing.assert_array_equal(adaptation.posterior(), unknown)
+    assert (known[0] != unknown[0]).all()
+
+
 @pytest.fixture(scope="module")
 def known() -> Any:
     """Models that know so many tasks, made once."""

@@ -166,7 +166,7 @@ def test_seeds_may_be_numbers_of_numpy(tiny_pearl: MakePEARL) -> None:
     model = tiny_pearl()
     seeds: Any = np.arange(2)
     for seed in seeds:
-        model.adapt(ENV_ID, n_episodes=1, seed=seed)
+        model.adapt(ENV_ID, n_episodes=1, task=0, seed=seed)
         evaluate_adaptation(model, ENV_ID, n_episodes=1, seed=seed)
 
 

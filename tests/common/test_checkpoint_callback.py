@@ -162,6 +162,21 @@ def test_a_state_sets_what_goes_on_and_nothing_else(tiny_pearl: MakePEARL) -> No
     assert model.num_timesteps == 480 and model.gamma == 0.9
 
 
+def test_within_another_callback_it_would_save_nothing(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    within = EveryNTimesteps(ROLLOUT, CheckpointCallback(1, str(tmp_path)))
+    with pytest.raises(ValueError, match=r"within EveryNTimesteps hears nothing of rollouts.*pass it beside that one"):
+        tiny_pearl().learn(ROLLOUT, within)
+
+
+def test_a_training_after_one_that_was_stopped_is_none_that_was(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    model, callback = tiny_pearl(), CheckpointCallback(1, str(tmp_path))
+    callback.stop()
+    model.learn(3 * ROLLOUT, callback)
+    stopped = model.num_timesteps
+    model.learn(2 * ROLLOUT, callback, reset_num_timesteps=False)
+    assert stopped <= ROLLOUT and model.num_timesteps >= stopped + 2 * ROLLOUT
+
+
 def test_some_checkpoints_are_kept() -> None:
     with pytest.raises(ValueError, match="keep is 0, expected a whole number of at least 1"):
         CheckpointCallback(1, "run", keep=0)

@@ -1,5 +1,6 @@
 """The progress bar moves during updates, and the time that it says remains is what remains."""
 
+import copy
 import time
 from itertools import pairwise
 from typing import Any
@@ -88,6 +89,16 @@ def test_a_training_after_one_that_was_interrupted_in_its_first_rollout(tiny_pea
     with pytest.raises(KeyboardInterrupt):
         model.learn(ROLLOUT, callback=interrupt, progress_bar=True)
     assert model.learn(ROLLOUT).num_timesteps == ROLLOUT
+
+
+def test_a_training_that_was_interrupted_leaves_nothing_that_cannot_be_copied(tiny_pearl: MakePEARL) -> None:
+    def fail(*_: Any) -> bool:
+        raise RuntimeError
+
+    model = tiny_pearl()
+    with pytest.raises(RuntimeError):
+        model.learn(ROLLOUT, fail, progress_bar=True)
+    copy.deepcopy(model.learn(ROLLOUT))
 
 
 def test_a_clock_of_another_process_is_no_clock(tiny_pearl: MakePEARL) -> None:

@@ -480,6 +480,14 @@ def test_settings_given_to_load_are_checked_as_the_constructors(tiny_pearl: Make
                 PEARL.load(tmp_path / "model", env=env, **kwargs)
 
 
+def test_what_follows_from_the_time_limit_is_known_without_an_env(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    tiny_pearl().save(tmp_path / "model")
+    loaded = PEARL.load(tmp_path / "model", gamma=None, context_size=None, gradient_steps=None)
+    trained = PEARL.load(tmp_path / "model", tiny_pearl().env, gamma=None, context_size=None, gradient_steps=None)
+    for name in ("gamma", "context_size", "gradient_steps"):
+        assert getattr(loaded, name) == getattr(trained, name) > 0, name
+
+
 def test_a_file_has_nothing_that_load_makes_anew(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
     tiny_pearl().learn(ROLLOUT).save(tmp_path / "model")
     data, _, _ = load_from_zip_file(tmp_path / "model")
