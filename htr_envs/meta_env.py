@@ -97,7 +97,7 @@ class TaskDistribution(ABC):
         :param tasks: one task or several.
         :param shape: the shape that they must have, (..., task_dim).
         :return: the tasks, float32.
-        :raises ValueError: if they are not numbers, have another shape, or lie outside ``task_space``.
+        :raises ValueError: if they are not finite numbers, have another shape, or lie outside ``task_space``.
         """
         try:
             vectors = np.array(tasks, dtype=np.float32)
@@ -105,8 +105,8 @@ class TaskDistribution(ABC):
             raise ValueError(f"The task {tasks!r} is not made of numbers: pass a float vector of shape {shape}.") from None
         if vectors.shape != shape:
             raise ValueError(f"The task has shape {vectors.shape}, expected {shape}: pass a vector of the task space.")
-        # written so that nan, which compares with nothing, is refused too
-        if not np.all((vectors >= self.task_space.low) & (vectors <= self.task_space.high)):
+        # a space without bounds holds infinity
+        if not np.all(np.isfinite(vectors) & (vectors >= self.task_space.low) & (vectors <= self.task_space.high)):
             raise ValueError(f"The task {vectors.tolist()} is not in {self.task_space}: pass a vector of the task space.")
         return vectors
 

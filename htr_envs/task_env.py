@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from htr_envs.meta_env import FloatArray, MetaEnv, TaskDistribution
+from htr_envs.meta_env import FloatArray, HasTaskFamily, MetaEnv, TaskDistribution
 
 BoolArray = NDArray[np.bool_]
 
@@ -140,7 +140,23 @@ def told_by_hook(name: str, values: Any, expected: tuple[int, ...]) -> Any:
     return values
 
 
-class TaskEnv(MetaEnv):
+class HasRewardHooks(HasTaskFamily):
+    """An env's rewards are those of its family."""
+
+    task_family: TaskFamily
+    reward_type: str
+
+    def compute_reward(self, traj: Trajectory, task: ArrayLike, reward_type: str | None = None) -> FloatArray:
+        """:meth:`TaskFamily.compute_reward`, by default of the env's own reward type."""
+        tasks, of_env = np.asarray(task, dtype=np.float32), self.reward_type
+        return self.task_family.compute_reward(traj, tasks, of_env if reward_type is None else reward_type)
+
+    def hindsight_task(self, traj: Trajectory, index: ArrayLike) -> FloatArray:
+        """:meth:`TaskFamily.hindsight_task`."""
+        return self.task_family.hindsight_task(traj, np.asarray(index))
+
+
+class TaskEnv(HasRewardHooks, MetaEnv):
     """An environment whose reward depends on a task that the observation never shows.
 
     A subclass sets ``observation_space`` and ``action_space`` and writes the dynamics in ``_reset_state`` and ``_step_state``;
@@ -157,8 +173,6 @@ class TaskEnv(MetaEnv):
     :param reward_type: reward of ``step``, ``"sparse"`` (the true one) or ``"dense"`` (the proxy).
     :raises ValueError: if the reward type is unknown.
     """
-
-    task_family: TaskFamily
 
     def __init__(self, task_family: TaskFamily, reward_type: str = "sparse") -> None:
         check_reward_type(reward_type)
@@ -195,12 +209,3 @@ class TaskEnv(MetaEnv):
             "task_free_reward": float(traj.task_free_reward[0]),
         }
         return observation, float(reward[0]), bool(terminated), False, info
-
-    def compute_reward(self, traj: Trajectory, task: ArrayLike, reward_type: str | None = None) -> FloatArray:
-        """:meth:`TaskFamily.compute_reward`, by default of the env's own reward type."""
-        tasks, of_env = np.asarray(task, dtype=np.float32), self.reward_type
-        return self.task_family.compute_reward(traj, tasks, of_env if reward_type is None else reward_type)
-
-    def hindsight_task(self, traj: Trajectory, index: ArrayLike) -> FloatArray:
-        """:meth:`TaskFamily.hindsight_task`."""
-        return self.task_family.hindsight_task(traj, np.asarray(index))

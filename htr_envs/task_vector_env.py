@@ -12,11 +12,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from htr_envs.meta_env import HasTaskFamily, checked_action, task_from_options
-from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, check_reward_type, told_by_hook
+from htr_envs.meta_env import checked_action, task_from_options
+from htr_envs.task_env import BoolArray, FloatArray, HasRewardHooks, TaskFamily, Trajectory, check_reward_type, told_by_hook
 
 
-class TaskVectorEnv(HasTaskFamily, VectorEnv[FloatArray, FloatArray, NDArray[Any]], ABC):
+class TaskVectorEnv(HasRewardHooks, VectorEnv[FloatArray, FloatArray, NDArray[Any]], ABC):
     """Many copies of a task environment that step together, without a loop over them.
 
     A subclass writes the same two hooks as for :class:`htr_envs.TaskEnv`, on arrays. The rule on tasks is the same too, for
@@ -43,7 +43,6 @@ class TaskVectorEnv(HasTaskFamily, VectorEnv[FloatArray, FloatArray, NDArray[Any
     :raises ValueError: if the reward type is unknown or a number is smaller than 1.
     """
 
-    task_family: TaskFamily
     metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # type: ignore[misc]
 
     def __init__(

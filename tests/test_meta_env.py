@@ -12,7 +12,7 @@ from gymnasium.wrappers import TimeLimit
 
 from helpers import TINY, MakePEARL, parameters
 from helpers.broken_envs import LineEnv
-from helpers.carts import make_cart
+from helpers.carts import CartEnv, make_cart
 from sb3_htr import PEARL, evaluate_adaptation, load_untrusted
 from sb3_htr.adaptation.evaluation import record_adaptation
 from sb3_htr.adaptation.loop import adaptation_steps
@@ -85,6 +85,15 @@ def test_the_posterior_is_that_of_the_rewards(tiny_pearl: MakePEARL) -> None:
 def test_what_needs_successes_is_refused(tiny_pearl: MakePEARL, changed: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         tiny_pearl(make_cart(), **{**PLAIN, **changed})
+
+
+@pytest.mark.parametrize("task", [np.inf, -np.inf, np.nan])
+def test_no_task_is_infinite(task: float) -> None:
+    """A space without bounds holds it."""
+    env = CartEnv()
+    env.task_family.task_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+    with pytest.raises(ValueError, match=r"The task \[.*\] is not in Box.*: pass a vector of the task space"):
+        env.reset(options={"task": [task]})
 
 
 class DoubleEnv(LineEnv):

@@ -73,7 +73,7 @@ def check_flags(**flags: Any) -> None:
     :raises ValueError: for the first one that is neither True nor False, as a word in a YAML file is
     """
     for name, value in flags.items():
-        if not isinstance(value, bool):
+        if not isinstance(plain(value), bool):
             raise ValueError(f"{name} is {value!r}, expected True or False.")
 
 

@@ -20,6 +20,8 @@ from sb3_htr.common.vec_wrappers import PatientResultsWriter, TaskVecMonitor
 N_ENVS = 20
 # Attributes of a single task env, and where a batched one keeps those of all envs
 PER_ENV = {"task": "tasks", "task_id": "task_ids"}
+# And what else a batched one has by another name: its own spaces are those of all envs together
+NAMES = {**PER_ENV, "action_space": "single_action_space", "observation_space": "single_observation_space"}
 
 
 class BatchedTaskVecEnv(VecEnv):
@@ -39,20 +41,22 @@ class BatchedTaskVecEnv(VecEnv):
         super().__init__(vector_env.num_envs, vector_env.single_observation_space, vector_env.single_action_space)
 
     def reset(self) -> VecEnvObs:
+        given = self._options
+        # Before any of them is refused, so that the next reset does not meet them again
+        self._reset_options()
         # A batch has one random generator, so the first env's seed is the batch's
-        obs, info = self.vector_env.reset(seed=self._seeds[0], options=self._batch_options())
+        obs, info = self.vector_env.reset(seed=self._seeds[0], options=self._batch_options(given))
         self.reset_infos = self._split(info)
         self._reset_seeds()
-        self._reset_options()
         return obs.copy()  # an env may write into the same array at each step, and this one is kept
 
-    def _batch_options(self) -> dict[str, Any] | None:
-        keys = {key for options in self._options for key in options}
+    def _batch_options(self, given: list[dict[str, Any]]) -> dict[str, Any] | None:
+        keys = {key for options in given for key in options}
         if not keys:
             return None
-        if any(options.keys() != keys for options in self._options):
+        if any(options.keys() != keys for options in given):
             raise ValueError(f"Envs of one batch need options with the same keys, got {sorted(keys)} in some of them only.")
-        return {key: np.array([options[key] for options in self._options]) for key in keys}
+        return {key: np.array([options[key] for options in given]) for key in keys}
 
     def step_async(self, actions: np.ndarray) -> None:
         self._actions = actions
@@ -77,11 +81,11 @@ class BatchedTaskVecEnv(VecEnv):
         self.vector_env.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        value = getattr(self.vector_env, PER_ENV.get(attr_name, attr_name))
+        value = getattr(self.vector_env, NAMES.get(attr_name, attr_name))
         return [value[i] if attr_name in PER_ENV else value for i in self._get_indices(indices)]
 
     def has_attr(self, attr_name: str) -> bool:
-        return hasattr(self.vector_env, PER_ENV.get(attr_name, attr_name))
+        return hasattr(self.vector_env, NAMES.get(attr_name, attr_name))
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         if attr_name in PER_ENV:
@@ -89,11 +93,16 @@ class BatchedTaskVecEnv(VecEnv):
         # For all, as they share what they are made of, a generator too
         if attr_name != "np_random":
             self._check_is_for_all(indices)
-        setattr(self.vector_env, attr_name, value)
+        setattr(self.vector_env, NAMES.get(attr_name, attr_name), value)
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
         self._check_is_for_all(indices)
-        return [getattr(self.vector_env, method_name)(*args, **kwargs)] * self.num_envs
+        method = self._set_task if method_name == "set_task" else getattr(self.vector_env, method_name)
+        return [method(*args, **kwargs)] * self.num_envs
+
+    def _set_task(self, task: Any) -> None:
+        # A batch would take a vector for an index of each env
+        cast(Any, self.vector_env).set_task(np.tile(task, (self.num_envs, 1)) if np.ndim(task) == 1 else task)
 
     def _check_is_for_all(self, indices: VecEnvIndices) -> None:
         if len(list(self._get_indices(indices))) < self.num_envs:

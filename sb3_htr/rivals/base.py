@@ -66,10 +66,20 @@ class ResetCallback(BaseCallback):
         return True
 
 
-class FiniteStepsCallback(BaseCallback):
-    """Ends a training where the env returns NaN or infinity, of which the libraries learn until all networks are NaN."""
+class CheckedStepsCallback(BaseCallback):
+    """
+    Ends a training where the env returns NaN or infinity, of which the libraries learn until all networks are NaN; and where
+    it is on no training task, as an evaluation in it leaves it.
+    """
 
     def _on_step(self) -> bool:
+        for i, info in enumerate(self.locals["infos"]):
+            if info.get("task_id") == -1:
+                raise ValueError(
+                    f"info['task_id'] of env {i} is -1, expected a training task: the env chose another task, or a callback "
+                    "stepped the envs of training, as one that evaluates in them within a rollout does; give it envs of its "
+                    "own."
+                )
         check_finite("reward", self.locals["rewards"])
         self._check(self.locals["new_obs"])
         for env in np.flatnonzero(self.locals["dones"]):
@@ -133,6 +143,14 @@ class Rival(CheckedFiles, Resumable):
         """
         check_device(settings.get("device", "auto"))
         self.check_names(settings)
+        self._check_ranges(settings)
+        policy_class = self.policy_aliases.get(policy) if isinstance(policy, str) else policy
+        if policy_class is not None:
+            check_keywords("policy_kwargs", settings.get("policy_kwargs") or {}, policy_class)
+        return checked_seed(seed)
+
+    @staticmethod
+    def _check_ranges(settings: dict[str, Any]) -> None:
         for name, value in settings.items():
             # Schedules, and an entropy coefficient that is learnt, are the library's to read
             if (
@@ -142,10 +160,11 @@ class Rival(CheckedFiles, Resumable):
                 and not (name == "ent_coef" and isinstance(value, str))
             ):
                 check_numbers(**{name: (value, *RANGES[name])})
-        policy_class = self.policy_aliases.get(policy) if isinstance(policy, str) else policy
-        if policy_class is not None:
-            check_keywords("policy_kwargs", settings.get("policy_kwargs") or {}, policy_class)
-        return checked_seed(seed)
+
+    def _setup_model(self) -> None:
+        # Not in the constructor alone: settings can be given to load, too, in place of those of the file
+        self._check_ranges(vars(self))
+        super()._setup_model()
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
@@ -189,8 +208,10 @@ class Rival(CheckedFiles, Resumable):
 
     def check_env(self, env: VecEnv) -> None:
         """
-        :param env: to adapt in
-        :raises ValueError: if its spaces are not those of training, it normalizes, or it is what the model trains on
+        :param env: to adapt in. It may be the one that the model was made with, where a rollout begins, which resets it; a
+            rollout that was broken off ends with ValueError at its next step
+        :raises ValueError: if its spaces are not those of training, it normalizes, or it is wrapped as in training, to show
+            more than its observations
         """
         check_is_not_normalized(env)
         if isinstance(env, self.WRAPPERS):
@@ -272,7 +293,7 @@ class Rival(CheckedFiles, Resumable):
         return [*super()._excluded_save_params(), "_log_interval"]
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        result = followed_by(callback, CallbackList([FiniteStepsCallback(), ResetCallback()]))
+        result = followed_by(callback, CallbackList([CheckedStepsCallback(), ResetCallback()]))
         for part in parts_of(result):
             if not isinstance(part, EvalCallback) or isinstance(part, MetaEvalCallback):
                 continue

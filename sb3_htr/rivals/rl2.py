@@ -82,7 +82,8 @@ class RL2(OnPolicyRival, RecurrentPPO):
     :param n_trials_per_rollout: trials of each env between two updates
     :param seed: seed of all random generators
     :param kwargs: arguments of ``RecurrentPPO`` but ``n_steps``, which follows. ``batch_size`` is four trials by default, and
-        ``gamma`` reaches over a trial: 1 - 1 / steps of a trial, which is the library's 0.99 on the Point Robot
+        ``gamma`` reaches over a trial: 1 - 1 / steps of a trial, which is the library's 0.99 on the Point Robot. In ``load``
+        they do not follow trials of another length: they are settings of the file
     :raises ValueError: for an env without tasks or time limit, or a number that is out of its range
     """
 
@@ -107,22 +108,20 @@ class RL2(OnPolicyRival, RecurrentPPO):
         seed: int | None = None,
         **kwargs: Any,
     ) -> None:
-        check_numbers(n_episodes_per_trial=(n_episodes_per_trial, 1), n_trials_per_rollout=(n_trials_per_rollout, 1))
+        self.n_episodes_per_trial = n_episodes_per_trial
+        self.n_trials_per_rollout = n_trials_per_rollout
+        self._check_trials()
         seed = self._check_settings(policy, seed, kwargs)
         if isinstance(env, str):
             env = make_task_vec_env(env, N_ENVS, seed)
-        n_steps = 1
         if env is not None:
             env = self._in_trials(self._wrap_env(env), n_episodes_per_trial)
-            n_steps = n_trials_per_rollout * env.max_trial_steps
             # Gradients go through a minibatch, in the order of its steps, and no further
             kwargs.setdefault("batch_size", N_TRIALS_PER_BATCH * env.max_trial_steps)
             # What the first episodes find out is worth what the last ones return
             kwargs.setdefault("gamma", 1 - 1 / env.max_trial_steps)
-        self.n_episodes_per_trial = n_episodes_per_trial
-        self.n_trials_per_rollout = n_trials_per_rollout
-        # What a rival checks was checked, and n_steps is no setting
-        RecurrentPPO.__init__(self, policy, env, n_steps=n_steps, seed=seed, **kwargs)  # type: ignore[arg-type]
+        # What a rival checks was checked
+        RecurrentPPO.__init__(self, policy, env, seed=seed, **kwargs)  # type: ignore[arg-type]
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
@@ -136,7 +135,14 @@ class RL2(OnPolicyRival, RecurrentPPO):
         assert isinstance(env, TrialVecEnv)
         return TrialVecEnv(env.venv, n_episodes)
 
+    def _check_trials(self) -> None:
+        check_numbers(n_episodes_per_trial=(self.n_episodes_per_trial, 1), n_trials_per_rollout=(self.n_trials_per_rollout, 1))
+
     def _setup_model(self) -> None:
+        # Of the file, or given to load
+        self._check_trials()
+        if self.env is not None:
+            self.n_steps = self._n_steps_in(self.env)
         super()._setup_model()
         self._set_trials()
 
@@ -153,15 +159,16 @@ class RL2(OnPolicyRival, RecurrentPPO):
 
     def _set_trials(self) -> None:
         if self.env is not None:
-            self._check_time_limit(self.env)
             self.env = self._in_trials(self.env, self.n_episodes_per_trial)
 
+    def _n_steps_in(self, env: VecEnv) -> int:
+        return self.n_trials_per_rollout * self.n_episodes_per_trial * get_max_episode_steps(env)
+
     def _check_time_limit(self, env: VecEnv) -> None:
-        n_steps = self.n_trials_per_rollout * self.n_episodes_per_trial * get_max_episode_steps(env)
-        if n_steps != self.n_steps:
+        if (n_steps := self._n_steps_in(env)) != self.n_steps:
             raise ValueError(
                 f"Whole trials in this env are rollouts of {n_steps} steps, but those of the model have {self.n_steps}: give "
-                "an env of the same time limit, or make a new model."
+                "an env of the same time limit, or pass this one to load."
             )
 
     def train(self) -> None:

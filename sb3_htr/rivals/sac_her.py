@@ -142,13 +142,6 @@ class SACHER(OffPolicyRival, SAC):
         seed: int | None = None,
         **kwargs: Any,
     ) -> None:
-        check_numbers(gradient_steps=(gradient_steps, -1))
-        replay = replay_buffer_kwargs or {}
-        check_keywords("replay_buffer_kwargs", replay, HerReplayBuffer, without=GIVEN_BY_MODEL)
-        check_numbers(n_sampled_goal=(replay.get("n_sampled_goal", 4), 0))
-        strategy = replay.get("goal_selection_strategy", "future")
-        if isinstance(strategy, str) and strategy.lower() not in KEY_TO_GOAL_STRATEGY:
-            raise ValueError(f"goal_selection_strategy is {strategy!r}, expected one of {sorted(KEY_TO_GOAL_STRATEGY)}.")
         super().__init__(
             policy,
             env,
@@ -167,6 +160,15 @@ class SACHER(OffPolicyRival, SAC):
 
     def _setup_model(self) -> None:
         self._check_policy_class()
+        # Before a replay is made of them; not in the constructor, as they can be given to load, too
+        self._check_ranges(vars(self))
+        check_numbers(gradient_steps=(self.gradient_steps, -1))
+        replay = self.replay_buffer_kwargs
+        check_keywords("replay_buffer_kwargs", replay, HerReplayBuffer, without=GIVEN_BY_MODEL)
+        check_numbers(n_sampled_goal=(replay.get("n_sampled_goal", 4), 0))
+        strategy = replay.get("goal_selection_strategy", "future")
+        if isinstance(strategy, str) and strategy.lower() not in KEY_TO_GOAL_STRATEGY:
+            raise ValueError(f"goal_selection_strategy is {strategy!r}, expected one of {sorted(KEY_TO_GOAL_STRATEGY)}.")
         if self.env is None:
             # Loaded for prediction only: SB3 wants a buffer, we want no memory of it
             self.replay_buffer = DictReplayBuffer(1, self.observation_space, self.action_space)  # type: ignore[arg-type]

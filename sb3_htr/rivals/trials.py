@@ -121,6 +121,6 @@ class TrialVecEnv(CopiedWrapper):
             final[env] = infos[env]["terminal_observation"]
         final = self._last.beside(final)
         for env in envs:
-            infos[env] |= {"terminal_observation": final[env], "TimeLimit.truncated": False}
+            infos[env].update({"terminal_observation": final[env], "TimeLimit.truncated": False})
         self._episode[envs] = 0
         self._last.forget(envs)

@@ -13,7 +13,7 @@ from gymnasium.error import ResetNeeded
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from helpers import ENV_ID
-from htr_envs import PointRobotVectorEnv
+from htr_envs import PointRobotVectorEnv, Trajectory
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
 
 
@@ -34,6 +34,15 @@ def test_options_of_a_batch_must_agree() -> None:
     env = make_task_vec_env(ENV_ID, 2)
     env.set_options([{"task_id": 1}, {}])
     with pytest.raises(ValueError, match="options with the same keys"):
+        env.reset()
+
+
+def test_options_that_a_batch_refused_are_not_asked_for_again() -> None:
+    env = make_task_vec_env(ENV_ID, 2)
+    for refused in ([{"task_id": 1}, {}], [{"task_id": 1}, {"task_id": 999}], {"tusk": 1}):
+        env.set_options(refused)
+        with pytest.raises(ValueError, match=r"options|out of range"):
+            env.reset()
         env.reset()
 
 
@@ -90,8 +99,46 @@ def test_a_batch_is_as_single_envs_are_one_by_one() -> None:
         for _ in range(20):
             *_, dones, _ = env.step(np.zeros((2, 2), dtype=np.float32))
         assert dones.all() and [info["task_id"] for info in env.unwrapped.reset_infos] == env.get_attr("task_id")
-    for name in ("train_tasks", "validation_tasks", "test_tasks", "task_space"):
+    for name in ("train_tasks", "validation_tasks", "test_tasks", "task_space", "action_space", "observation_space"):
         np.testing.assert_equal(batch.get_attr(name), single.get_attr(name))
+
+
+@pytest.mark.parametrize("task", [np.array([1, 0]), [0, 1], (0.5, -0.5)])
+def test_a_vector_is_one_task_for_all_envs_also_of_a_batch(task: Any) -> None:
+    """It is as long as there are envs, and could be an index for each."""
+    for kind in (None, DummyVecEnv):
+        env = make_task_vec_env(ENV_ID, 2, vec_env_class=kind)
+        env.env_method("set_task", task)
+        env.reset()
+        assert env.get_attr("task_id") == [-1, -1]
+        np.testing.assert_array_equal(env.get_attr("task"), np.array([task, task], dtype=np.float32))
+        with pytest.raises(ValueError, match="The task has shape"):
+            env.env_method("set_task", [1, 0, 0])
+
+
+@pytest.mark.parametrize("reward_type", ["sparse", "dense"])
+def test_a_batch_has_the_reward_hooks_of_single_envs(reward_type: str) -> None:
+    batch, single = (
+        make_task_vec_env(ENV_ID, 2, env_kwargs={"reward_type": reward_type}, vec_env_class=kind)
+        for kind in (None, DummyVecEnv)
+    )
+    obs, actions, next_obs = np.random.default_rng(0).uniform(-0.2, 0.2, (3, 5, 2)).astype(np.float32)
+    traj = Trajectory(obs, actions, next_obs, np.zeros(5, dtype=np.float32))
+    calls: list[tuple[str, Any]] = [
+        ("compute_reward", (traj, [0.1, 0.0])),
+        ("compute_reward", (traj, [0.1, 0.0], "dense")),
+        ("hindsight_task", (traj, 0)),
+        ("hindsight_task", (traj, [0, 3])),
+    ]
+    for name, arguments in calls:
+        of_batch, of_single = (env.env_method(name, *arguments) for env in (batch, single))
+        np.testing.assert_array_equal(of_batch, of_single)
+
+
+def test_a_batch_that_is_given_a_space_keeps_it() -> None:
+    env, space = make_task_vec_env(ENV_ID, 2), gym.spaces.Box(-20.0, 20.0, (2,), np.float32)
+    env.set_attr("observation_space", space)
+    assert env.get_attr("observation_space") == [space, space]
 
 
 def test_ctrl_c_leaves_envs_in_processes_to_the_training() -> None:

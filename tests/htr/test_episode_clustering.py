@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers import MakePEARL
-from helpers.experience import FAMILY, add_episode, make_buffer
+from helpers.experience import FAMILY, add_episode, assert_same, make_buffer
 from sb3_htr.htr import EpisodeClustering, MultiTaskReplayBuffer
 from sb3_htr.htr.relabel.episode_clustering import GridDiscretiser
 
@@ -160,12 +160,32 @@ def test_pearl_trains_with_it(tiny_pearl: MakePEARL) -> None:
     [
         ({"cell_size": 0.0}, "cell_size is 0.0, expected positive"),
         ({"cell_size": "wide"}, "cell_size is 'wide', expected positive widths"),
+        ({"cell_size": [0.1, 0.1, 0.1]}, "cell_size has 3 widths, expected one, or 2, one for each dimension of a task"),
         ({"exploratory_fraction": 1.0}, "exploratory_fraction is 1.0, expected a number from 0 to below 1"),
+        ({"exploratory_fraction": False}, "exploratory_fraction is False, expected a number from 0 to below 1"),
     ],
 )
 def test_bad_settings(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         filled(0, **settings)
+
+
+@pytest.mark.parametrize("settings", [{"exploratory_fraction": np.float32(0.25)}, {"prefer_unsolved": np.True_}])
+def test_numbers_and_flags_of_numpy_are_those_of_python(settings: dict[str, Any]) -> None:
+    theirs, ours = (filled(**some)[0] for some in (settings, {name: value.item() for name, value in settings.items()}))
+    assert_same(theirs.sample(8, context_size=20), ours.sample(8, context_size=20))
+
+
+def test_tasks_may_have_one_width_or_one_for_each_dimension() -> None:
+    cells = [filled(cell_size=size)[1]._tasks for size in (0.1, [0.1], [0.1, 0.1])]
+    np.testing.assert_array_equal(cells[0], cells[1])
+    np.testing.assert_array_equal(cells[0], cells[2])
+
+
+@pytest.mark.parametrize("discretise", [lambda tasks: tasks.round(1)[:1], lambda tasks: tasks[:, 0].round(1)])
+def test_a_discretiser_that_leaves_tasks_out_is_refused(discretise: Any) -> None:
+    with pytest.raises(ValueError, match=r"discretiser returned shape \(.*\) for tasks of shape \(.*, 2\), expected the same"):
+        filled(1, discretiser=discretise)
 
 
 def test_cells_that_the_start_does_not_solve_are_preferred() -> None:

@@ -6,7 +6,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from stable_baselines3.common.callbacks import CallbackList, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
@@ -48,6 +48,25 @@ def small(kind: Any, env: Any = None, **settings: Any) -> Any:
 def test_settings(kind: Any, settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         kind(kind.DEFAULT_POLICY, ENV_ID, **settings)
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "message"),
+    [
+        (RL2, {"gamma": 7.0}, "gamma is 7.0, expected a number from 0 to 1"),
+        (RL2, {"n_episodes_per_trial": -3}, "n_episodes_per_trial is -3, expected a whole number of at least 1"),
+        (RL2, {"n_trials_per_rollout": 0}, "n_trials_per_rollout is 0, expected a whole number of at least 1"),
+        (SACHER, {"gamma": 7.0}, "gamma is 7.0, expected a number from 0 to 1"),
+        (SACHER, {"buffer_size": 0}, "buffer_size is 0, expected a whole number of at least 1"),
+        (SACHER, {"gradient_steps": -2}, "gradient_steps is -2, expected a whole number of at least -1"),
+        (SACHER, {"replay_buffer_kwargs": {"n_sampled_goal": -1}}, "n_sampled_goal is -1, expected a whole number"),
+    ],
+)
+def test_settings_that_load_is_given(kind: Any, settings: dict[str, Any], message: str, tmp_path: Path) -> None:
+    small(kind).save(tmp_path / "model")
+    for env in (None, make_task_vec_env(ENV_ID, 2)):
+        with pytest.raises(ValueError, match=message):
+            kind.load(tmp_path / "model", env=env, **settings)
 
 
 @pytest.mark.parametrize("name", ["train_freq", "optimize_memory_usage", "replay_buffer_class"])
@@ -216,6 +235,32 @@ def test_sb3s_evaluation_is_refused_before_training(kind: Any) -> None:
     ours = MetaEvalCallback(ENV_ID, n_eval_episodes=1, eval_freq=20, verbose=0)
     model.learn(40, ours)
     assert ours.evaluations_timesteps
+
+
+class EvaluatesIn(BaseCallback):
+    """Where a rollout begins, and at a step."""
+
+    def __init__(self, env: VecEnv, step: int = 0) -> None:
+        super().__init__()
+        self.env, self.step = env, step
+
+    def _on_rollout_start(self) -> None:
+        evaluate_adaptation(cast(Any, self.model), self.env, "validation", n_episodes=1)
+
+    def _on_step(self) -> bool:
+        if self.n_calls == self.step:
+            self._on_rollout_start()
+        return True
+
+
+@RIVALS
+def test_an_evaluation_in_the_env_of_training_is_none_of_its_experience(kind: Any) -> None:
+    env = make_task_vec_env(ENV_ID, 2, 0)
+    model = small(kind, env)
+    assert model.learn(400, EvaluatesIn(env)).num_timesteps == 400
+    with pytest.raises(ValueError, match=r"task_id'\] of env 0 is -1, expected a training task: .*; give it envs of its own"):
+        model.learn(400, EvaluatesIn(env, 7))
+    assert model.num_timesteps == 16, "at the next step"
 
 
 def test_an_evaluation_that_would_show_no_window() -> None:

@@ -9,7 +9,8 @@ import torch as th
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.torch_layers import CombinedExtractor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecNormalize
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from helpers import ENV_ID
 from helpers.carts import make_cart
@@ -57,6 +58,23 @@ def test_a_trial_is_several_episodes_on_one_task(vec_env_class: Any) -> None:
     assert np.flatnonzero(np.any(all_dones, axis=1)).tolist() == [2 * N_STEPS - 1, 4 * N_STEPS - 1]
     first, second = np.array(tasks[: 2 * N_STEPS]), np.array(tasks[2 * N_STEPS :])
     assert (first == first[0]).all() and (second == second[0]).all() and (first[0] != second[0]).any()
+
+
+class InTuples(VecEnvWrapper):
+    """Has its infos in a tuple, as SB3's SubprocVecEnv has."""
+
+    def reset(self) -> VecEnvObs:
+        return self.venv.reset()
+
+    def step_wait(self) -> VecEnvStepReturn:
+        obs, rewards, dones, infos = self.venv.step_wait()
+        infos_in_a_tuple: Any = tuple(infos)
+        return obs, rewards, dones, infos_in_a_tuple
+
+
+def test_infos_may_be_in_a_tuple() -> None:
+    model = tiny_rl2(InTuples(make_task_vec_env(ENV_ID, 2, seed=0)))
+    assert model.learn(160).num_timesteps == 160
 
 
 def test_the_policy_sees_at_meta_test_what_it_saw_in_training() -> None:
@@ -120,6 +138,19 @@ def test_a_rollout_is_whole_trials_and_a_minibatch_some_of_them() -> None:
     assert model.n_steps == 2 * 3 * N_STEPS and model.batch_size == 4 * 3 * N_STEPS
     assert model.gamma == 1 - 1 / (3 * N_STEPS), "the discount reaches over a trial"
     assert tiny_rl2(n_episodes_per_trial=5).gamma == 0.99 and tiny_rl2(gamma=0.9).gamma == 0.9
+
+
+@pytest.mark.parametrize(
+    ("settings", "n_steps"),
+    [({}, 40), ({"n_trials_per_rollout": 2}, 80), ({"n_episodes_per_trial": 3}, 60), ({"max_episode_steps": 10}, 20)],
+)
+def test_a_rollout_follows_from_what_load_is_given(settings: dict[str, Any], n_steps: int, tmp_path: Any) -> None:
+    tiny_rl2().save(tmp_path / "model")
+    env_kwargs = {name: settings.pop(name) for name in ("max_episode_steps",) if name in settings}
+    loaded = RL2.load(tmp_path / "model", env=make_task_vec_env(ENV_ID, 2, env_kwargs=env_kwargs), **settings)
+    assert loaded.n_steps == loaded.rollout_buffer.buffer_size == n_steps
+    assert loaded.batch_size == 160 and loaded.gamma == 1 - 1 / 40, "settings of the file"
+    assert loaded.learn(4 * n_steps).num_timesteps == 4 * n_steps, "two rollouts of two envs"
 
 
 def test_it_sees_observations_on_one_scale_and_rewards_as_they_are(tmp_path: Any) -> None:

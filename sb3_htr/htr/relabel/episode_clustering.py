@@ -1,15 +1,18 @@
 """Episode Clustering (EC): relabelling when the data comes in."""
 
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch as th
 
-from sb3_htr.common.settings import check_flags
+from sb3_htr.common.settings import check_flags, plain
 from sb3_htr.common.type_aliases import Trajectory
 from sb3_htr.htr.relabel.base import HindsightDraw
 from sb3_htr.htr.relabel.hindsight_buffers import HindsightBuffers
 from sb3_htr.htr.relabel.hindsight_task import HindsightTaskStrategy, solved_at_start
+
+if TYPE_CHECKING:
+    from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 
 
 class Discretiser(Protocol):
@@ -78,15 +81,25 @@ class EpisodeClustering(HindsightBuffers):
         hindsight_task_strategy: HindsightTaskStrategy | str = "even",
         prefer_unsolved: bool = True,
     ) -> None:
-        if not (isinstance(exploratory_fraction, int | float) and 0 <= exploratory_fraction < 1):
+        fraction = plain(exploratory_fraction)
+        if isinstance(fraction, bool) or not (isinstance(fraction, int | float) and 0 <= fraction < 1):
             raise ValueError(f"exploratory_fraction is {exploratory_fraction!r}, expected a number from 0 to below 1.")
         check_flags(prefer_unsolved=prefer_unsolved)
         if not (discretiser is None or callable(discretiser)):
             raise ValueError(f"discretiser is {discretiser!r}, expected a function of tasks, or None for a grid.")
         self.discretiser = GridDiscretiser(cell_size) if discretiser is None else discretiser
-        self.exploratory_fraction = exploratory_fraction
+        self.exploratory_fraction = fraction
         self.hindsight_task_strategy = HindsightTaskStrategy.of(hindsight_task_strategy)
         self.prefer_unsolved = prefer_unsolved
+
+    def bind(self, buffer: "MultiTaskReplayBuffer") -> None:
+        super().bind(buffer)
+        task_dim = buffer.task_family.train_tasks.shape[1]
+        if isinstance(self.discretiser, GridDiscretiser) and self.discretiser.cell_size.shape not in ((), (1,), (task_dim,)):
+            raise ValueError(
+                f"cell_size has {self.discretiser.cell_size.size} widths, expected one, or {task_dim}, one for each dimension "
+                "of a task."
+            )
 
     def reset(self) -> None:
         self.make_buffers(0)
@@ -113,7 +126,13 @@ class EpisodeClustering(HindsightBuffers):
         rng = buffer.relabel_rng
         steps = strategy.steps(np.full(strategy.n_candidates, len(episode)), rng)
         traj = buffer.transitions.trajectory(episode)
-        representatives = np.asarray(self.discretiser(buffer.task_family.hindsight_task(traj, steps)), dtype=np.float32)
+        tasks = buffer.task_family.hindsight_task(traj, steps)
+        representatives = np.asarray(self.discretiser(tasks), dtype=np.float32)
+        if representatives.shape != tasks.shape:
+            raise ValueError(
+                f"discretiser returned shape {representatives.shape} for tasks of shape {tasks.shape}, expected the same: one "
+                "representative for each task."
+            )
         count = np.array([[1 + self._n_episodes_of(representative) for representative in representatives]])
         is_solved = None
         if self.prefer_unsolved:
