@@ -28,7 +28,7 @@ class MetaEvalCallback(EvalCallback):
     validation tasks by default, so that the test tasks stay unseen until the end. ``evaluations.npz`` has ``timesteps``
     (n,), ``results`` (n, n_tasks), the returns of the last episode, and ``returns`` and ``successes``
     (n, n_tasks, n_eval_episodes). A training that ends before its first evaluation is evaluated at its end,
-    but not where another callback calls this one, as ``EveryNTimesteps`` does, which has to with ``eval_freq=1``.
+    but not where another callback calls this one, as ``EveryNTimesteps`` does: give it ``eval_freq=1`` there.
 
     :param eval_env: env of the task family, VecEnv or registered id
     :param tasks: ``"validation"``, ``"test"``, ``"train"`` or task vectors (n_tasks, task_dim)

@@ -125,7 +125,7 @@ class CheckpointCallback(BaseCallback):
         self._last_calls = 0
         self._written: Path | None = None
         self._pending: dict[str, Any] | None = None
-        self.stopping = self._stopped = False
+        self.stopping = self._stopped = self._has_trained = False
 
     def restore(self, model: HasState, state: dict[str, Any]) -> None:
         """
@@ -164,12 +164,14 @@ class CheckpointCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         if self.parent is not None:
+            parent, self.parent = self.parent, None  # it may be passed alone next
             raise ValueError(
-                f"A CheckpointCallback within {type(self.parent).__name__} hears nothing of rollouts, between which it saves: "
+                f"A CheckpointCallback within {type(parent).__name__} hears nothing of rollouts, between which it saves: "
                 "pass it beside that one, with its own save_freq."
             )
-        if self._stopped:  # a training before this one
+        if self._has_trained:  # what stopped a training before this one
             self.stopping = self._stopped = False
+        self._has_trained = True
         if self._pending is not None:
             at = self._pending["model"]["counters"]["num_timesteps"]
             if self.num_timesteps != at:

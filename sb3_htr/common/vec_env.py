@@ -191,8 +191,9 @@ def make_task_vec_env(
 
         def make_env() -> gym.Env:
             if vec_env_class is SubprocVecEnv:
-                # Ctrl-C is for the training, which ends a rollout, and then these
+                # For the training, which ends a rollout, and then these
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
+                signal.signal(signal.SIGTERM, signal.SIG_IGN)
             # Not by its id alone: in a process of its own, the registry may not have it
             env = gym.make(spec, **env_kwargs)
             return env if wrapper is None else wrapper(env)

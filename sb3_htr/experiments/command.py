@@ -58,8 +58,9 @@ def main(argv: Sequence[str]) -> None:
     if not args.finished:
         on_this_machine = executors.SerialExecutor() if args.cell is not None else executors.Processes(args.jobs)
         try:
-            with terminated_as_interrupted():
-                driver.Driver(chosen, runs, executors.Ray(args.ray, args.device) if args.ray else on_this_machine).run()
+            executor = executors.Ray(args.ray, args.device) if args.ray else on_this_machine
+            with terminated_as_interrupted():  # Ray has a handler of its own
+                driver.Driver(chosen, runs, executor).run()
         except KeyboardInterrupt:
             print(f"\nStopped. What ran goes on from its checkpoint in {storage} with the same command.", file=sys.stderr)
             raise SystemExit(130) from None

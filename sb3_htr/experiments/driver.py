@@ -119,7 +119,7 @@ class Driver:
         elif error is not None:  # of this process alone: it, or a callback of its training, was told to stop
             print(f"{cell.label} was interrupted, and is left where it is.", file=sys.stderr, flush=True)
             self.failed[cell.label] = "it was interrupted"
-        elif future.result() and not self.runs.is_finished(cell):
+        elif future.result() and not (self.runs.is_finished(cell) or self.runs.is_claimed(cell)):
             self._fail(cell, f"its node has a result that is not in {self.runs} here: give --runs that all nodes see.")
 
     def _fail(self, cell: Cell, reason: str) -> None:

@@ -1,4 +1,4 @@
-"""Where cells run. An executor is a ``concurrent.futures.Executor`` that gives each call a process with one thread."""
+"""Where cells run: a ``concurrent.futures.Executor``, in which each call has a process, with one thread, to itself."""
 
 import os
 import signal
@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import suppress
-from multiprocessing import active_children, get_context, parent_process
-from threading import Thread
+from multiprocessing import get_context, parent_process
+from threading import Lock, Thread
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
@@ -42,9 +42,25 @@ class Processes(ThreadPoolExecutor):
         super().__init__(n)
         # They get the environment of this one; torch and BLAS would take all cores each
         os.environ["OMP_NUM_THREADS"] = "1"
+        self._running: set[int] = set()
+        self._ends, self._lock = False, Lock()
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
-        return super().submit(_in_a_process, fn, *args, **kwargs)
+        return super().submit(self._in_a_process, fn, *args, **kwargs)
+
+    def _in_a_process(self, fn: Callable[..., T], *args: Any, **kwargs: Any) -> T:
+        with ProcessPoolExecutor(1, get_context("spawn"), initializer=_begin_in_a_process) as process:
+            pid = process.submit(os.getpid).result()
+            with self._lock:
+                if self._ends:
+                    raise KeyboardInterrupt
+                self._running.add(pid)
+                future = process.submit(fn, *args, **kwargs)
+            try:
+                return future.result()
+            finally:
+                with self._lock:
+                    self._running.discard(pid)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """
@@ -53,9 +69,11 @@ class Processes(ThreadPoolExecutor):
         """
         super().shutdown(wait=False, cancel_futures=cancel_futures)
         while cancel_futures:
-            for child in active_children():
-                with suppress(ProcessLookupError):
-                    os.kill(child.pid or 0, signal.SIGINT)
+            with self._lock:
+                self._ends = True
+                for pid in self._running:
+                    with suppress(ProcessLookupError):
+                        os.kill(pid, signal.SIGINT)
             try:
                 return super().shutdown(wait)
             except KeyboardInterrupt:  # a second one: at once
@@ -70,6 +88,8 @@ def _begin_in_a_process() -> None:
     """
     if os.name == "posix":
         os.setpgrp()
+    for signal_ in (signal.SIGINT, signal.SIGTERM):  # a script's background commands ignore the one
+        signal.signal(signal_, signal.default_int_handler)
 
     def watch() -> None:
         parent = parent_process()
@@ -78,11 +98,6 @@ def _begin_in_a_process() -> None:
         os._exit(1)
 
     Thread(target=watch, daemon=True).start()
-
-
-def _in_a_process(fn: Callable[..., T], *args: Any, **kwargs: Any) -> T:
-    with ProcessPoolExecutor(1, get_context("spawn"), initializer=_begin_in_a_process) as process:
-        return process.submit(fn, *args, **kwargs).result()
 
 
 class Ray(Executor):

@@ -185,8 +185,8 @@ class OffPolicyMetaAlgorithm(MetaTest, ReplayFiles, CheckedFiles, SAC):
             max_episode_steps, n_envs = checks.get_max_episode_steps(self.env), self.env.num_envs
         # All envs are stepped, as often as it takes
         n_tasks = -(-self.n_tasks_per_rollout // n_envs) * n_envs
-        if self.env is None:
-            n_tasks = self.n_rollout_tasks or n_tasks
+        if self.env is None and n_tasks <= (self.n_rollout_tasks or 0) < 2 * n_tasks:
+            n_tasks = self.n_rollout_tasks or n_tasks  # of the file, rounded up to its envs
         given = {name: getattr(self, name) for name in BY_HORIZON}
         vars(self).update(complete(given, max_episode_steps, n_tasks))
         if self.env is not None:
@@ -331,15 +331,19 @@ class OffPolicyMetaAlgorithm(MetaTest, ReplayFiles, CheckedFiles, SAC):
         check_numbers(total_timesteps=(total_timesteps, 0.0))
         if log_interval is not None:
             check_numbers(log_interval=(log_interval, 1))
-        n_updates = self._n_updates
-        super().learn(
-            total_timesteps=total_timesteps,
-            callback=callback,
-            log_interval=log_interval,  # type: ignore[arg-type]
-            tb_log_name=tb_log_name,
-            reset_num_timesteps=reset_num_timesteps,
-            progress_bar=progress_bar,
-        )
+        n_updates, listeners = self._n_updates, list(self.update_listeners)
+        try:
+            super().learn(
+                total_timesteps=total_timesteps,
+                callback=callback,
+                log_interval=log_interval,  # type: ignore[arg-type]
+                tb_log_name=tb_log_name,
+                reset_num_timesteps=reset_num_timesteps,
+                progress_bar=progress_bar,
+            )
+        finally:
+            # A progress bar of a training that was interrupted is still there
+            self.update_listeners[:] = listeners
         if total_timesteps > 0:
             checks.warn_without_updates(self, n_updates)
             self._warn_without_successes()
@@ -358,10 +362,6 @@ class OffPolicyMetaAlgorithm(MetaTest, ReplayFiles, CheckedFiles, SAC):
             )
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        # A training that was interrupted has left its bar there
-        bars = [one for one in self.update_listeners if isinstance(getattr(one, "__self__", None), MetaProgressBarCallback)]
-        for bar in bars:
-            self.update_listeners.remove(bar)
         return super()._init_callback(followed_by(callback, MetaProgressBarCallback()) if progress_bar else callback)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:

@@ -17,6 +17,7 @@ import torch as th
 import htr_envs
 import sb3_htr
 from sb3_htr.common.versions import versions
+from sb3_htr.zoo.run.soft_interrupt import terminated_as_interrupted
 
 COMMANDS = {
     "train": "meta-train an agent, with rl_zoo3's arguments and YAML files",
@@ -142,7 +143,8 @@ def console() -> int:
     if "OMP_NUM_THREADS" not in os.environ:
         th.set_num_threads(1)
     try:
-        return main()
+        with terminated_as_interrupted():
+            return main()
     except KeyboardInterrupt:
         print("sb3-htr: stopped", file=sys.stderr)
         return 130

@@ -98,7 +98,7 @@ def test_a_training_that_was_interrupted_leaves_nothing_that_cannot_be_copied(ti
     model = tiny_pearl()
     with pytest.raises(RuntimeError):
         model.learn(ROLLOUT, fail, progress_bar=True)
-    copy.deepcopy(model.learn(ROLLOUT))
+    copy.deepcopy(model)
 
 
 def test_a_clock_of_another_process_is_no_clock(tiny_pearl: MakePEARL) -> None:

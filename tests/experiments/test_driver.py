@@ -10,13 +10,14 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from multiprocessing import active_children, get_context
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from sb3_htr.experiments import driver as driver_module
+from sb3_htr.experiments import executors
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.driver import ATTEMPTS, Driver
 from sb3_htr.experiments.executors import Processes, SerialExecutor
@@ -182,15 +183,31 @@ def test_a_killed_worker_process_takes_no_other_with_it() -> None:
         assert other.result() != os.getpid() and "terminated abruptly" in str(killed.exception())
 
 
-def test_who_stops_stops_what_runs_too() -> None:
+@pytest.mark.parametrize("n_begun", [0, 2])
+def test_who_stops_stops_what_runs_too(n_begun: int, tmp_path: Path) -> None:
     """Of a driver that is interrupted alone, as by a scheduler; what did not begin yet never does."""
     executor = Processes(2)
-    futures = [executor.submit(time.sleep, 100) for _ in range(3)]
-    while len(active_children()) < 2:
+    futures = [executor.submit(_sleep, tmp_path / str(i)) for i in range(3)]
+    while len(list(tmp_path.iterdir())) < n_begun:
         time.sleep(0.01)
     start = time.monotonic()
     executor.shutdown(cancel_futures=True)
-    assert time.monotonic() - start < 50 and all(future.done() for future in futures) and futures[2].cancelled()
+    assert time.monotonic() - start < 50 and futures[2].cancelled()
+    assert all(isinstance(future.exception(), KeyboardInterrupt) for future in futures[:2])
+
+
+def _sleep(begun: Path) -> None:
+    begun.touch()
+    time.sleep(100)
+
+
+def test_a_node_on_which_all_fails_at_once_does_not_take_the_queue(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(executors, "FAST", 0.5)
+    start = time.monotonic()
+    assert executors._call(divmod, 7, 2) == (3, 1) and time.monotonic() - start < 0.4
+    with pytest.raises(ZeroDivisionError):
+        executors._call(divmod, 7, 0)
+    assert time.monotonic() - start >= 0.5
 
 
 def test_one_that_is_interrupted_alone_ends_no_other(trains: Any, tmp_path: Path) -> None:
@@ -218,6 +235,18 @@ def test_what_a_server_does_not_answer_is_asked_again(trains: Any, tmp_path: Pat
     trained = trains(lambda cell, folder: None)
     Driver(CELLS, tmp_path, ThreadPoolExecutor(1)).run()
     assert sorted(trained) == sorted(cell.name for cell in CELLS) and not errors
+
+
+@pytest.mark.parametrize(("number", "is_said"), [(errno.ESTALE, False), (errno.ENOSYS, True), (errno.EACCES, True)])
+def test_what_will_never_work_is_said(number: int, is_said: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any) -> Any:
+        raise OSError(number, "no lock")
+
+    (cell, *_), folder = CELLS, SharedFolder(tmp_path)
+    cell.run_folder(tmp_path).mkdir(parents=True)
+    monkeypatch.setattr("sb3_htr.experiments.storage.folder.lock_of", fail)
+    with pytest.raises(OSError, match="no lock") if is_said else nullcontext():
+        assert folder.is_claimed(cell)
 
 
 def test_the_job_array_of_the_manual_runs_its_cell(tmp_path: Path) -> None:

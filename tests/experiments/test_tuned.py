@@ -1,3 +1,5 @@
+"""Settings that are said to be those of a search are."""
+
 import csv
 import pathlib
 from typing import Any

@@ -168,6 +168,7 @@ def test_no_password_is_printed() -> None:
     for storage in ("logs/study.log", "sqlite:///study.db", "postgresql+psycopg://me@/x?host=/tmp/socket"):
         assert without_password(storage) == storage
     assert without_password("postgresql+psycopg://me:secret@db/x") == "postgresql+psycopg://me:***@db/x"
+    assert "secret" not in without_password("postgresql+psycopg://db/x?user=me&password=secret")
 
 
 def test_a_run_of_a_trial_keeps_no_password_and_goes_on_without_the_study(

@@ -76,11 +76,11 @@ class Claim:
 
         :return: whether nobody took it over
         """
-        if not self.is_ours():
-            return False
-        self._count += 1
-        self.files.pipe_file(self._path, self._content())
-        return True
+        if self.is_ours():
+            self._count += 1
+            self.files.pipe_file(self._path, self._content())
+            return True
+        return max(self._claims(), default="") <= self._path
 
     def release(self) -> None:
         """Leave it to whoever comes."""

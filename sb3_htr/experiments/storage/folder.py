@@ -1,9 +1,10 @@
 """Runs in a folder that all nodes see under one name, with the locks of its file system."""
 
+import errno
 import os
 import sys
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,9 @@ from filelock import Timeout
 from sb3_htr.common.checkpoint import n_steps_done
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.runner import lock_of, run_cell
+
+# What a server says, or its client, that is out of reach for a while
+AWAY = (errno.ESTALE, errno.EIO, errno.ETIMEDOUT, errno.EHOSTDOWN)
 
 
 class SharedFolder:
@@ -25,6 +29,9 @@ class SharedFolder:
         # As all nodes name it: where a link leads may be known here alone
         self.runs = Path(os.path.abspath(runs))
         self._listed: dict[Path, set[str]] = {}
+        self._n_steps: dict[str, int] = {}
+        # Folders that do not answer
+        self._away: set[Path] = set()
 
     def __str__(self) -> str:
         return str(self.runs)
@@ -36,12 +43,21 @@ class SharedFolder:
     def look(self, cells: Sequence[Cell]) -> None:
         """A listing is fresh where answers about single files may be remembered, as by NFS."""
         for folder in {cell.result(self.runs).parent for cell in cells}:
-            try:
-                self._listed[folder] = set(os.listdir(folder))
-            except FileNotFoundError:
-                self._listed[folder] = set()
-            except OSError as error:  # a server that is out of reach for a while: what was seen before holds
-                print(f"{folder} could not be read: {error}", file=sys.stderr, flush=True)
+            with self._patient(folder):
+                self._listed[folder] = set(os.listdir(folder)) if folder.exists() else set()
+
+    @contextmanager
+    def _patient(self, folder: Path) -> Iterator[None]:
+        """What was seen before holds where a server does not answer, until it does."""
+        try:
+            yield
+        except OSError as error:
+            if error.errno not in AWAY:
+                raise
+            print(f"{folder} does not answer: {error}", file=sys.stderr, flush=True)
+            self._away.add(folder)
+        else:
+            self._away.discard(folder)
 
     def is_finished(self, cell: Cell) -> bool:
         """Whether it has a result."""
@@ -49,20 +65,26 @@ class SharedFolder:
         return result.name in self._listed.get(result.parent, ())
 
     def is_claimed(self, cell: Cell) -> bool:
-        """Whether a process has its lock."""
-        if not cell.run_folder(self.runs).exists():
-            return False
-        try:
-            lock_of(cell, self.runs).acquire(timeout=0).lock.release()
-        except (Timeout, OSError):  # what cannot be asked cannot be begun either
+        """Whether a process has its lock, or nobody can tell."""
+        folder = cell.result(self.runs).parent
+        if folder in self._away:
             return True
-        return False
+        with self._patient(folder):
+            if not cell.run_folder(self.runs).exists():
+                return False
+            try:
+                lock_of(cell, self.runs).acquire(timeout=0).lock.release()
+            except Timeout:
+                return True
+            return False
+        return True
 
     def n_steps(self, cell: Cell) -> int:
         """Env steps before its latest checkpoint."""
-        with suppress(OSError):
-            return max((n_steps_done(run) for run in cell.run_folder(self.runs).glob("*/*")), default=0)
-        return 0
+        with self._patient(cell.result(self.runs).parent):
+            runs = cell.run_folder(self.runs).glob("*/*")
+            self._n_steps[cell.label] = max((n_steps_done(run) for run in runs), default=0)
+        return self._n_steps.get(cell.label, 0)
 
     def call(self, cell: Cell) -> tuple[Any, ...]:
         """See :func:`sb3_htr.experiments.runner.run_cell`."""

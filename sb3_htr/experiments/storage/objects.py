@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
-from threading import Event, Thread
+from threading import Event, Thread, current_thread, main_thread
 from types import TracebackType
 from typing import Any, TypeVar
 
@@ -185,12 +185,14 @@ def run_on_copy(cell: Cell, url: str, void: bytes | None = None) -> bool:
     files, root = _opened(url)
     there, result = f"{root}/{_folder(cell)}", f"{root}/{_result(cell)}"
     claim, lost = Claim(files, f"{there}/{CLAIMS}"), Event()
+    in_main_thread = current_thread() is main_thread()
 
     def renew() -> None:
         if not claim.renew() and not lost.is_set():
             print(f"{cell.label} was taken over by another process: this one stops.", file=sys.stderr, flush=True)
             lost.set()
-            interrupt_main()
+            if in_main_thread:
+                interrupt_main()
 
     try:
         if not _patiently(lambda: claim.take(void)):

@@ -2,7 +2,6 @@
 
 import contextlib
 import warnings
-from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable
 from functools import partial
@@ -39,7 +38,7 @@ OPTIONS = {
 }
 
 
-class MetaExperimentManager(ExperimentManager, ABC):
+class MetaExperimentManager(ExperimentManager):
     """
     rl_zoo3's manager: hyperparameters of method, env and user, and task envs that are stepped as one batch, whose arguments in
     the YAML reach the evaluation too. What a training does with them, and what a search, subclasses say.
@@ -54,9 +53,12 @@ class MetaExperimentManager(ExperimentManager, ABC):
         self._method_name = method
         self.resumed = resumed
 
-    @abstractmethod
+    def _check_use(self) -> None:
+        """Of the hyperparameters that were given."""
+
     def _settings_of_trial(self, trial_id: int | None) -> dict[str, Any]:
         """Hyperparameters of a trial of a study, if they are asked for."""
+        return {}
 
     def _block_of_env(self) -> dict[str, Any]:
         """Of the YAML file, or of a module of hyperparameters."""
@@ -109,7 +111,9 @@ class MetaExperimentManager(ExperimentManager, ABC):
             given = checked(given, self.resumed / RECORD)
         checked_kinds(given, "-params" if self.resumed is None else self.resumed / RECORD)
         self._given = given
-        hyperparams = merged(merged(hyperparams, checked(self._settings_of_trial(trial_id), self.storage)), given)
+        self._check_use()
+        of_trial = checked(self._settings_of_trial(trial_id), self.storage if self.resumed is None else self.resumed / RECORD)
+        hyperparams = merged(merged(hyperparams, of_trial), given)
         if self.n_timesteps > 0:
             hyperparams["n_timesteps"] = self.n_timesteps
         if missing := sorted({"policy", "n_timesteps"} - hyperparams.keys()):

@@ -2,7 +2,6 @@
 
 import traceback
 from pathlib import Path
-from typing import Any
 
 import optuna
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
@@ -17,7 +16,7 @@ from sb3_htr.zoo.run.study import check_is_of
 class SearchManager(MetaExperimentManager):
     """Of one worker of a study."""
 
-    def _settings_of_trial(self, trial_id: int | None) -> dict[str, Any]:
+    def _check_use(self) -> None:
         if self.method.algorithm.search_space is None:
             raise ValueError(
                 f"Nothing is known of what to search for {self.method.name}: give register_algorithm a search_space, or "
@@ -34,7 +33,6 @@ class SearchManager(MetaExperimentManager):
                 "hyperparams": self._given,
             }
             check_is_of(self.storage, self.study_name, facts, note=True)
-        return {}
 
     def create_log_folder(self) -> None:
         """Trials have none."""

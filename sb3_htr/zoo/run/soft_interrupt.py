@@ -16,20 +16,21 @@ def soft_interrupt(checkpointing: CheckpointCallback | None) -> Iterator[None]:
         yield
         return
 
+    before = {signal_: signal.getsignal(signal_) for signal_ in (signal.SIGINT, signal.SIGTERM)}
+
     def stop(signum: int, frame: Any) -> None:
-        restore()
+        # One of the other kind may be the same wish, as a scheduler tells all processes, and one of them tells others
+        signal.signal(signum, before[signal.Signals(signum)])
         print("Stopping after this rollout, with a checkpoint. Press Ctrl-C again to stop at once.")
         checkpointing.stop()
 
-    def restore() -> None:
-        for signal_, handler in before.items():
-            signal.signal(signal_, handler)
-
-    before = {signal_: signal.signal(signal_, stop) for signal_ in (signal.SIGINT, signal.SIGTERM)}
     try:
+        for signal_ in before:
+            signal.signal(signal_, stop)
         yield
     finally:
-        restore()
+        for signal_, handler in before.items():
+            signal.signal(signal_, handler)
 
 
 @contextlib.contextmanager

@@ -97,4 +97,8 @@ def without_password(storage: str) -> str:
     :return: the same, with *** in place of a password
     """
     url = url_of(storage)
-    return storage if url is None or url.password is None else url.render_as_string()
+    if url is None or (url.password is None and "password" not in url.query):
+        return storage
+    if "password" in url.query:
+        url = url.update_query_dict({"password": "***"})
+    return url.render_as_string()
