@@ -55,9 +55,8 @@ class Processes(ThreadPoolExecutor):
                 if self._ends:
                     raise KeyboardInterrupt
                 self._running.add(pid)
-                future = process.submit(fn, *args, **kwargs)
             try:
-                return future.result()
+                return process.submit(fn, *args, **kwargs).result()
             finally:
                 with self._lock:
                     self._running.discard(pid)
