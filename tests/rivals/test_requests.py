@@ -14,6 +14,7 @@ from helpers import ENV_ID
 from sb3_htr import evaluate_adaptation
 from sb3_htr.adaptation.adaptation import Step
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
+from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.rivals.rl2 import RL2
 from sb3_htr.rivals.sac_her import SACHER
@@ -245,7 +246,8 @@ class EvaluatesIn(BaseCallback):
         self.env, self.step = env, step
 
     def _on_rollout_start(self) -> None:
-        evaluate_adaptation(cast(Any, self.model), self.env, "validation", n_episodes=1)
+        tasks = get_task_family(self.env).validation_tasks[:2]
+        evaluate_adaptation(cast(Any, self.model), self.env, tasks, n_episodes=1)
 
     def _on_step(self) -> bool:
         if self.n_calls == self.step:
