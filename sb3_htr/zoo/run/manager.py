@@ -54,7 +54,7 @@ class MetaExperimentManager(ExperimentManager):
         self.resumed = resumed
 
     def _check_use(self) -> None:
-        """Of the hyperparameters that were given."""
+        """Refuse what they, or other arguments, are no use for here. Called when :attr:`method` is known."""
 
     def _settings_of_trial(self, trial_id: int | None) -> dict[str, Any]:
         """Hyperparameters of a trial of a study, if they are asked for."""

@@ -14,7 +14,7 @@ from sb3_htr.zoo.run.study import check_is_of
 
 
 class SearchManager(MetaExperimentManager):
-    """Of one worker of a study."""
+    """One worker of a study."""
 
     def _check_use(self) -> None:
         if self.method.algorithm.search_space is None:

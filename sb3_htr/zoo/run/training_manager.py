@@ -29,7 +29,7 @@ from sb3_htr.zoo.run.trust import check_arguments, plain_settings
 
 
 class TrainingManager(MetaExperimentManager):
-    """Of a run that is new, or goes on from its latest checkpoint."""
+    """A run that is new, or goes on from its latest checkpoint."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
