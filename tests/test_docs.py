@@ -38,9 +38,7 @@ def test_the_code_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.chdir(tmp_path)
     # For a moment, where the page trains for seconds or minutes
     code = python_blocks(page).replace("model.learn()", "model.learn(8000)").replace("gradient_steps=100", "gradient_steps=5")
-    code = code.replace(
-        'PEARL("MlpPolicy", "SparsePointRobot-v0"', 'PEARL("MlpPolicy", "SparsePointRobot-v0", gradient_steps=5'
-    )
+    code = re.sub(r'(PEARL\(\s*"MlpPolicy",\s*"SparsePointRobot-v0")', r"\1, gradient_steps=5", code)
     (tmp_path / "page.py").write_text(code)
     runpy.run_path("page.py", run_name="__main__")
 
@@ -110,7 +108,7 @@ def test_a_new_family_takes_less_than_60_lines() -> None:
 
 # Later arguments win, so these make each command of the manual a short one
 SHORT = {
-    "train": ["-n", "480", "--eval-freq", "480", "--verbose", "0", "-params", *SMALL],
+    "train": ["-n", "480", "--eval-freq", "480", "--eval-episodes", "2", "--verbose", "0", "-params", *SMALL],
     "optimize": ["-n", "480", "--verbose", "0", "-params", *(setting for setting in SMALL if "policy_kwargs" not in setting)],
     "evaluate": ["--n-episodes", "2"],
     "enjoy": ["--n-episodes", "2"],

@@ -137,13 +137,6 @@ def test_a_longer_time_limit_needs_other_room(tiny_pearl: MakePEARL) -> None:
         model.set_env(make_task_vec_env(ENV_ID, 4, env_kwargs={"max_episode_steps": 40}))
 
 
-def test_settings_of_another_time_limit_are_warned_of(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
-    tiny_pearl().save(tmp_path / "model")
-    longer = make_task_vec_env(ENV_ID, 4, env_kwargs={"max_episode_steps": 40})
-    with pytest.warns(UserWarning, match="time limit is 40 steps, and what follows from it is still of 20: .*gamma"):
-        PEARL.load(tmp_path / "model", env=longer)
-
-
 def test_an_entropy_coefficient_of_another_kind_than_the_files(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
     for theirs, ours in (("auto", 0.01), (0.01, "auto")):
         tiny_pearl(ent_coef=theirs).save(tmp_path / "model")

@@ -33,6 +33,8 @@ from sb3_htr.zoo.commands import train
 from sb3_htr.zoo.run.agents import agent_at
 from sb3_htr.zoo.run.shipped import hyperparams_file
 
+TINY = Variant("htr-ser", "tiny", OF_CELL, {"n_test_tasks": 4})
+
 
 @pytest.fixture(autouse=True)
 def fast(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -135,9 +137,8 @@ def test_a_killed_run_goes_on_and_a_finished_one_is_tested(tmp_path: Path, monke
 
 def test_a_killed_evaluation_goes_on_after_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Unless the code is another one by then."""
-    variant = Variant("htr-ser", "tiny", OF_CELL, {"n_test_tasks": 4})
     tests = by(("prior", "belief"), {}, {"goal_distance": 0.3})
-    (cell,) = Experiment("one", "", ENV_ID, 480, (variant,), 1, 480, tests, n_episodes=3).cells()
+    (cell,) = Experiment("one", "", ENV_ID, 480, (TINY,), 1, 480, tests, n_episodes=3).cells()
     here, elsewhere = tmp_path / "here", tmp_path / "elsewhere"
     here.mkdir()
     most, made = 5, list[str]()
@@ -166,7 +167,7 @@ def test_a_killed_evaluation_goes_on_after_what_it_has(tmp_path: Path, monkeypat
 
 def test_a_last_checkpoint_that_cannot_be_written_is_no_interrupt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The grid goes on with its other cells, and says why this one did not end."""
-    (cell,) = Experiment("one", "", ENV_ID, 960, (Variant("htr-ser", "", OF_CELL, {"n_test_tasks": 4}),), 1, 480).cells()
+    (cell,) = Experiment("one", "", ENV_ID, 960, (TINY,), 1, 480, n_episodes=2).cells()
 
     def write_unless_last(folder: Path, state: dict[str, Any]) -> None:
         if state["model"]["counters"]["num_timesteps"] >= 960:
@@ -211,8 +212,7 @@ def test_the_command_repeats_an_experiment(
 
 
 def test_results_of_other_settings_are_not_taken_for_those_of_a_cell(tmp_path: Path) -> None:
-    variant = Variant("htr-ser", "tiny", OF_CELL, {"n_test_tasks": 4})
-    (cell,) = Experiment("one", "", ENV_ID, 480, (variant,), 1, 480, by(("prior",)), n_episodes=2).cells()
+    (cell,) = Experiment("one", "", ENV_ID, 480, (TINY,), 1, 480, by(("prior",)), n_episodes=2).cells()
     assert run_cell(cell, tmp_path)
     for other in (
         replace(cell, settings={**OF_CELL, "gamma": 0.5}),
@@ -229,17 +229,19 @@ def test_results_of_other_settings_are_not_taken_for_those_of_a_cell(tmp_path: P
 
 
 def test_a_run_by_another_file_of_settings_is_not_that_of_a_cell(tmp_path: Path) -> None:
-    (cell,) = Experiment("one", "", ENV_ID, 480, (Variant("htr-ser", "tiny", OF_CELL),), 1, 480, by(("prior",))).cells()
+    (cell,) = Experiment("one", "", ENV_ID, 480, (TINY,), 1, 480, by(("prior",)), n_episodes=2).cells()
     blocks = yaml.safe_load(hyperparams_file("pearl.yml").read_text())
     (tmp_path / "mine.yml").write_text(yaml.safe_dump({"default": {**blocks["default"], "kl_coef": 7.0}}))
     assert main([*["train", *cell.training(cell.run_folder(tmp_path))], "-conf", str(tmp_path / "mine.yml")]) == 0
-    with pytest.raises(ValueError, match=r"has kl_coef 7\.0, but one/tiny-seed1 needs None, as the experiment or the YAML"):
+    with pytest.raises(
+        ValueError, match=r"has kl_coef 7\.0, but one/tiny-n_test_tasks4-seed1 needs None, as the experiment or the YAML"
+    ):
         run_cell(cell, tmp_path)
 
 
 def test_a_training_that_was_interrupted_in_its_last_updates_is_not_finished(tmp_path: Path) -> None:
     """It leaves a model of as many env steps as were planned."""
-    (cell,) = Experiment("one", "", ENV_ID, 480, (Variant("htr-ser", "tiny", OF_CELL),), 1, 480, by(("prior",))).cells()
+    (cell,) = Experiment("one", "", ENV_ID, 480, (TINY,), 1, 480, by(("prior",)), n_episodes=2).cells()
     folder = cell.run_folder(tmp_path)
     assert main(["train", *cell.training(folder)]) == 0
     run, _ = find_finished(cell, folder) or pytest.fail("there is one")
@@ -281,7 +283,7 @@ def test_plain_settings_of_a_variant_reach_its_evaluation(tmp_path: Path) -> Non
         Variant("rl2", "trials", trial, kwargs),
         Variant("sac-her", "told", of_sac, kwargs),
     )
-    for cell in Experiment("settings", "", ENV_ID, 960, variants, 1, 960, by(("prior",))).cells():
+    for cell in Experiment("settings", "", ENV_ID, 960, variants, 1, 960, by(("prior",)), n_episodes=2).cells():
         assert run_cell(cell, tmp_path)
         agent = agent_at(cell.run_folder(tmp_path), "last")
         both = [replace(agent, trusted=trust).load() for trust in (False, True)]
@@ -331,7 +333,7 @@ def test_what_is_for_the_training_to_say_is_left_to_it(settings: Any, tmp_path: 
 
 def test_the_code_that_evaluated_is_that_of_the_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever was committed since it began."""
-    (cell,) = Experiment("one", "", ENV_ID, 480, (Variant("htr-ser", "", OF_CELL, {"n_test_tasks": 4}),), 1, 480).cells()
+    (cell,) = Experiment("one", "", ENV_ID, 480, (TINY,), 1, 480, by(("prior",)), n_episodes=2).cells()
     monkeypatch.setattr("sb3_htr.common.versions.commit", lambda: {"commit": "later", "dirty": False})
     monkeypatch.setattr("sb3_htr.experiments.runner.commit", lambda: {"commit": "later", "dirty": False}, raising=False)
     assert run_cell(cell, tmp_path)

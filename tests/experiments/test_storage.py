@@ -357,7 +357,7 @@ def test_what_killed_processes_left_is_removed_and_no_other(tmp_path: Path, monk
 
 def test_a_killed_node_costs_what_it_had_not_sent(tmp_path: Path, url: str) -> None:
     """The result is that of a run that nobody disturbed."""
-    (cell,) = Experiment("one", "", ENV_ID, 4_800, (TINY_RUN,), 1, 480, by(("prior",))).cells()
+    (cell,) = Experiment("one", "", ENV_ID, 4_800, (TINY_RUN,), 1, 480, by(("prior",)), n_episodes=2).cells()
     pickled = tmp_path / "cell"
     pickled.write_bytes(pickle.dumps(cell))
     paths = os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])

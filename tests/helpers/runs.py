@@ -39,7 +39,7 @@ NOWHERE = ["--env", ENV_ID, "-f", "/nowhere"]
 
 def train_arguments(folder: Path, n: int = 240, *arguments: str, env_id: str = ENV_ID, eval_freq: int = -1) -> list[str]:
     """A command line to which settings can be added."""
-    how_long = ["-n", str(n), "--eval-freq", str(eval_freq), "--verbose", "0"]
+    how_long = ["-n", str(n), "--eval-freq", str(eval_freq), "--eval-episodes", "2", "--verbose", "0"]
     return ["train", "--env", env_id, "-f", str(folder), *how_long, *arguments, "-params", *SMALL]
 
 

@@ -9,7 +9,7 @@ import torch as th
 from stable_baselines3.common.vec_env import VecNormalize
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL, parameters, with_policy
-from sb3_htr import PEARL, evaluate_adaptation, load_untrusted
+from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.common.normalizer import ObservationNormalizer
 from sb3_htr.common.type_aliases import Context
 from sb3_htr.common.vec_env import make_task_vec_env
@@ -105,19 +105,6 @@ def test_evaluation_leaves_them_alone(trained: PEARL) -> None:
     after = parameters(trained)
     statistics = [name for name in before if name.startswith("normalizer.")]
     assert len(statistics) == 3 and all(th.equal(before[name], after[name]) for name in statistics)
-
-
-def test_they_are_saved_with_the_weights(trained: PEARL, tmp_path: Path) -> None:
-    trained.save(tmp_path / "model")
-    expected = evaluate_adaptation(trained, ENV_ID, n_episodes=3)
-    policy = type(trained.policy)
-    trained.policy.save(str(tmp_path / "policy"))
-    for loaded in (PEARL.load(tmp_path / "model"), load_untrusted(tmp_path / "model.zip", ENV_ID)):
-        assert all(th.equal(value, parameters(trained)[name]) for name, value in parameters(loaded).items())
-        for ours, theirs in zip(evaluate_adaptation(loaded, ENV_ID, n_episodes=3), expected, strict=True):
-            np.testing.assert_array_equal(ours, theirs)
-    alone = policy.load(str(tmp_path / "policy"))
-    assert th.equal(alone.normalize(th.ones(1, 2)), trained.policy.normalize(th.ones(1, 2)))
 
 
 def test_without_it_observations_are_as_they_are(tiny_pearl: MakePEARL) -> None:

@@ -105,28 +105,6 @@ def test_a_deep_copy_of_a_deep_copy_learns_and_saves_its_replay(tmp_path: Any) -
     assert twin.learn(80, reset_num_timesteps=False).num_timesteps == 160
 
 
-def test_training_is_on_training_tasks_after_an_evaluation_in_the_same_env() -> None:
-    env = make_task_vec_env(ENV_ID, 4, seed=0)
-    model = tiny_sac_her(env).learn(80)
-    evaluate_adaptation(model, env, n_episodes=1)
-    seen: set[int] = set()
-
-    def look(local: dict[str, Any], _: Any) -> bool:
-        seen.update(info["task_id"] for info in local["infos"])
-        return True
-
-    model.learn(160, look)
-    assert len(seen) > 1 and -1 not in seen
-
-
-@pytest.mark.parametrize(("log_interval", "n_logs"), [(1, 4), (2, 2), (None, 0)])
-def test_logs_are_so_many_rollouts_apart(log_interval: Any, n_logs: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    model, logs = tiny_sac_her(), list[int]()
-    monkeypatch.setattr(model, "dump_logs", lambda: logs.append(model.num_timesteps))
-    model.learn(320, log_interval=log_interval)
-    assert len(logs) == n_logs and logs[-1:] == [320] * (n_logs > 0)
-
-
 def test_episodes_that_end_early_are_nothing_to_warn_of(recwarn: pytest.WarningsRecorder) -> None:
     """A rollout then ends within episodes."""
     model = tiny_sac_her(BatchedTaskVecEnv(DynamicsVectorEnv(PointRobotFamily(), FallingDynamics(4), max_episode_steps=20)))

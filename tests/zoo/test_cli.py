@@ -26,8 +26,7 @@ def test_a_command_takes_one_thread_unless_told_otherwise(monkeypatch: pytest.Mo
         th.set_num_threads(before)
 
 
-@pytest.mark.parametrize("unbuffered", ["", "1"])
-@pytest.mark.parametrize("arguments", [["--version"], ["evaluate", "--help"]])
+@pytest.mark.parametrize(("arguments", "unbuffered"), [(["--version"], "1"), (["evaluate", "--help"], "")])
 def test_who_has_read_enough_is_told_nothing(arguments: list[str], unbuffered: str) -> None:
     """As `sb3-htr ... | head -1` does; a container often buffers nothing."""
     reader, writer = os.pipe()

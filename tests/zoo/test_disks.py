@@ -145,7 +145,7 @@ def test_an_old_checkpoint_that_cannot_be_removed_ends_no_training(
     assert len(checkpoints(tmp_path)) == 4
 
 
-@pytest.mark.parametrize("seconds", [0, -1e9, 5e9], ids=["1970", "1938", "2128"])
+@pytest.mark.parametrize("seconds", [0, 5e9], ids=["1970", "2128"])
 def test_a_wrong_clock_ends_no_training(seconds: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """SB3's model files are zip files, which know no such time; checkpoints know none at all."""
     with (

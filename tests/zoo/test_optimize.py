@@ -39,6 +39,7 @@ SMALL = ["-params", "n_tasks_per_rollout:4", "n_episodes_per_task:3", "learning_
 
 def search_command(folder: Path, storage: str, *more: str, n_trials: int = 2, method: str | None = None) -> list[str]:
     arguments = ["optimize", "--env", ENV_ID, "-f", str(folder), "-n", "480", "--n-trials", str(n_trials), "--seed", "1"]
+    arguments += ["--eval-episodes", "2"]
     # Near goals: trials of any seed have something to report
     arguments += ["--env-kwargs", "goal_distance:0.1", *(["--method", method] if method else [])]
     return [*arguments, "--n-evaluations", "2", "--storage", storage, "--study-name", "test", "--verbose", "0", *more, *SMALL]
@@ -72,6 +73,7 @@ def test_workers_with_one_command_do_not_draw_alike(quick: None, tmp_path: Path,
     storage = f"sqlite:///{tmp_path}/study.db"
     optuna.create_study(study_name="one", storage=storage).ask()
     command = ["optimize", "--env", ENV_ID, "-n", "240", "--n-trials", "1", "-f", str(tmp_path), "--seed", "1"]
+    command += ["--eval-episodes", "2"]
     command += ["--storage", storage, "--study-name", "one", "--verbose", "0", *SMALL]
     for _ in range(2):
         assert main(command) == 0
@@ -188,12 +190,8 @@ def test_a_run_of_a_trial_keeps_no_password_and_goes_on_without_the_study(
     assert PEARL.load(run / f"{ENV_ID}.zip").gamma == 0.77
 
 
-def test_a_study_in_postgresql(postgresql: str, quick: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    check_search(tmp_path, postgresql, capsys)
-
-
 def test_two_workers_search_at_once_in_postgresql(postgresql: str, tmp_path: Path) -> None:
-    """As two terminals do, with one command."""
+    """As two terminals do, with one command; a training takes what one of them tried."""
     small = ["gradient_steps:2", "batch_size:4", "meta_batch_size:4", "policy_kwargs:{'net_arch':[8],'encoder_arch':[8]}"]
     command = [*search_command(tmp_path, postgresql, "--study-name", "both"), *small]
     code = f"import sys; from sb3_htr.zoo.cli import main; sys.exit(main({command}))"
@@ -204,6 +202,10 @@ def test_two_workers_search_at_once_in_postgresql(postgresql: str, tmp_path: Pat
     assert len({trial.params["learning_rate"] for trial in trials}) == 4
     first, second = trials[:2]
     assert first.datetime_complete and second.datetime_start and second.datetime_start < first.datetime_complete, "at once"
+    training = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-n", "240", "--eval-freq", "-1", "--verbose", "0"]
+    assert main([*training, "--storage", postgresql, "--study-name", "both", "--trial-id", "0", *SMALL, *small]) == 0
+    model = PEARL.load(run_folder(tmp_path) / f"{ENV_ID}.zip")
+    assert model.learning_rate(1.0) == trials[0].params["learning_rate"]  # type: ignore[operator]
 
 
 def test_bad_storages_are_named_in_one_sentence(quick: None, tmp_path: Path) -> None:

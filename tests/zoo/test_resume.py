@@ -270,7 +270,7 @@ def test_the_last_one_cleans_up(unbroken: Path, tmp_path: Path) -> None:
 
 def test_kills_at_random_moments_change_nothing(unbroken: Path, tmp_path: Path) -> None:
     """SIGKILL of a real process, again and again."""
-    n_kills = int(os.environ.get("SB3_HTR_KILLS", 4))
+    n_kills = int(os.environ.get("SB3_HTR_KILLS", 2))
     moments = random.Random(n_kills)
     command = [sys.executable, "-m", "sb3_htr.zoo.cli"]
     run = run_folder(tmp_path)
