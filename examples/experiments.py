@@ -1,4 +1,4 @@
-"""Experiments of one's own: families of this folder, by the protocol of the package.
+"""Experiments of one's own: families of this folder, by the protocol of the package. In the root of the repository:
 
     sb3-htr experiment two_link_arm --gym-packages examples.experiments
     sb3-htr experiment hidden_target_reacher --gym-packages examples.experiments
@@ -10,7 +10,7 @@
     sb3-htr experiment dense_context --gym-packages examples.experiments
 
 All settings are the defaults, those of SparseAnt-v0 on both ants, but for half_cheetah_velocity and dense_context, whose
-rewards are dense: they have PEARL's own protocol.
+rewards are dense and which have PEARL's own protocol, and for the variants of ant_goal that say so.
 """
 
 from examples import (  # noqa: F401 register the envs

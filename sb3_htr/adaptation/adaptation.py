@@ -131,7 +131,7 @@ class Adaptation:
         self.task_reward = np.zeros(n_envs, dtype=np.float64)
         self.episode_return = np.zeros(n_envs, dtype=np.float64)
         self.best_return = np.zeros(n_envs, dtype=np.float64)
-        # What the most rewarded step returned beside what it would without success, whether that was taken for one or not
+        #: (n_envs,) what the most rewarded step returned beside what it would without success, taken for one or not
         self.largest_reward = np.zeros(n_envs, dtype=np.float64)
         # Of the running episodes: observations, actions, rewards
         self._running: list[np.ndarray] = []
