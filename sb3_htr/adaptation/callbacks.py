@@ -15,7 +15,7 @@ from sb3_htr.adaptation.evaluation import MetaLearner, check_adapts, first_succe
 from sb3_htr.adaptation.explorers import to_explorer
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checks import check_is_env, get_task_family
-from sb3_htr.common.errors import WRITE_ERRORS, reason
+from sb3_htr.common.errors import reason
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
 
@@ -77,7 +77,16 @@ class MetaEvalCallback(EvalCallback):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """
         :param state: of :meth:`state_dict`
+        :raises ValueError: if its evaluations are of other numbers of tasks and episodes, as they go into one file
         """
+        shape = len(self.tasks), self.n_eval_episodes
+        for returns in state["returns"][:1]:
+            if returns.shape != shape:
+                (n_tasks, n_episodes), (ours, of_ours) = returns.shape, shape
+                raise ValueError(
+                    f"This training was begun with evaluations of {n_episodes} episodes on {n_tasks} tasks, and this callback "
+                    f"has {of_ours} on {ours}: give n_eval_episodes and tasks as they were."
+                )
         self.evaluations_timesteps = list(state["timesteps"])
         self.returns = [returns.numpy() for returns in state["returns"]]
         self.successes = [successes.numpy() for successes in state["successes"]]
@@ -145,7 +154,7 @@ class MetaEvalCallback(EvalCallback):
         """Whether it could be written: a disk that is full stops no training."""
         try:
             save(path)
-        except WRITE_ERRORS as error:
+        except OSError as error:
             warnings.warn(f"{path} could not be written ({reason(error)}). Training goes on.", stacklevel=2)
             return False
         return True

@@ -1,6 +1,7 @@
 """Meta-test: how well does an agent adapt to tasks that it has never seen?"""
 
 from collections.abc import Callable
+from contextlib import closing
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -186,10 +187,10 @@ def record_adaptation(
     tasks = "test" if tasks is None else tasks
     if isinstance(env, str):
         # Of how many tasks, one env tells. Draws depend on the number of envs: the same tasks have it by name and as an array
-        one = make_task_vec_env(env)
-        n_tasks = len(task_set(get_task_family(one), tasks))
-        one.close()
-        env = make_task_vec_env(env, min(n_tasks, N_ENVS), seed)
+        with closing(make_task_vec_env(env)) as one:
+            n_tasks = len(task_set(get_task_family(one), tasks))
+        with closing(make_task_vec_env(env, min(n_tasks, N_ENVS), seed)) as made:
+            return record_adaptation(model, made, tasks, n_episodes, explorer, deterministic, seed, on_end)
     check_is_env(env)
     if isinstance(env, gym.Env):
         env = BaseAlgorithm._wrap_env(env, monitor_wrapper=False)

@@ -2,11 +2,18 @@
 
 import errno
 import os
+import re
 import shutil
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from uuid import uuid4
+
+from sb3_htr.common.errors import last_line
+
+# What torch and zip files, of a full disk and of a clock that zip files do not know, make no OSError of
+OF_WRITING = re.compile(r"PytorchStreamWriter|inline_container|\bZIP\b")
 
 
 @contextmanager
@@ -17,7 +24,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     :param path: file or folder to make; its parent folders are made too
     :return: path to write to, with the same suffix; removed if writing fails
-    :raises OSError: if the folder cannot be written to
+    :raises OSError: if the folder, or the file to its end, cannot be written to
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -41,6 +48,10 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
                 os.fsync(parent)
             finally:
                 os.close(parent)
+    except (RuntimeError, ValueError, struct.error) as error:
+        if isinstance(error, struct.error) or OF_WRITING.search(str(error)):
+            raise OSError(last_line(error)) from error
+        raise
     finally:
         if temporary.is_dir():
             shutil.rmtree(temporary)

@@ -17,8 +17,8 @@ from stable_baselines3.common.logger import TensorBoardOutputFormat
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.callback import parts_of
 from sb3_htr.common.checkpoint import CHECKPOINTS, checkpoints, n_steps_at, write_checkpoint
-from sb3_htr.common.errors import WRITE_ERRORS, reason
-from sb3_htr.common.settings import check_numbers
+from sb3_htr.common.errors import reason
+from sb3_htr.common.settings import check_numbers, keywords_of
 
 # What is recorded but not written yet
 LOGGER_STATE = ("name_to_value", "name_to_count", "name_to_excluded")
@@ -42,9 +42,9 @@ class HasState(Protocol):
 def numbers_of(callback: BaseCallback) -> dict[str, Any]:
     """
     :param callback: that has no state of its own to tell, as SB3's have none
-    :return: its numbers, counts among them
+    :return: its numbers, counts among them, but for those that it is made with
     """
-    plain = {name: _plain(value) for name, value in vars(callback).items()}
+    plain = {name: _plain(value) for name, value in vars(callback).items() if name not in keywords_of(type(callback))}
     return {name: value for name, value in plain.items() if type(value) in NUMBERS}
 
 
@@ -53,8 +53,8 @@ def restore_numbers(callback: BaseCallback, numbers: dict[str, Any]) -> None:
     :param callback: which has these numbers
     :param numbers: of :func:`numbers_of`; what else a file may name stays as it is
     """
-    # A default may be an attribute of the class
-    known = {name for name in numbers if type(_plain(getattr(callback, name, None))) in NUMBERS}
+    # A default may be an attribute of the class; older files have what the callback was made with
+    known = {name for name in numbers if type(_plain(getattr(callback, name, None))) in NUMBERS} - keywords_of(type(callback))
     vars(callback).update({name: value for name, value in numbers.items() if name in known and type(value) in NUMBERS})
 
 
@@ -83,10 +83,6 @@ def cut_monitor_files(run: Path, folder: Path, sizes: dict[str, int]) -> None:
             with atomic_path(target) as temporary:
                 temporary.write_bytes(path.read_bytes()[: sizes[name]])
         path.unlink()
-
-
-class NotPlain(ValueError):
-    """A state that no checkpoint can hold."""
 
 
 class CheckpointCallback(BaseCallback):
@@ -222,9 +218,7 @@ class CheckpointCallback(BaseCallback):
         self._stopped = self.stopping
         try:
             write_checkpoint(folder, self._state())
-        except NotPlain:
-            raise  # is no full disk, and would never be written
-        except WRITE_ERRORS as error:
+        except OSError as error:
             then = "Training goes on, and tries again before the next rollout."
             if self._stopped:
                 then = "Training stops as it was asked to: what was trained since the checkpoint before is lost."
@@ -285,7 +279,7 @@ class CheckpointCallback(BaseCallback):
                 file.seek(0)
                 th.load(file, weights_only=True)
             except Exception as error:
-                raise NotPlain(
+                raise ValueError(
                     f"The state_dict() of {type(callback).__name__} cannot be saved: it may hold tensors, numbers of Python, "
                     "texts and None, in lists, tuples and dicts."
                 ) from error

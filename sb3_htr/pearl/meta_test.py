@@ -1,6 +1,7 @@
 """What a trained model does on new tasks: adapt to one, or to several side by side, and act."""
 
 import warnings
+from contextlib import closing
 from functools import partial
 from typing import Any
 
@@ -100,9 +101,14 @@ class MetaTest(SAC):
         :raises ValueError: for several envs, an env with other spaces, a task that the env does not have, episodes without end
         """
         check_numbers(n_episodes=(n_episodes, 1), seed=(seed, 0, MAX_SEED))
-        vec_env = self._wrap_env(gym.make(env) if isinstance(env, str) else env, monitor_wrapper=False)
-        if isinstance(env, str) and task is None and vec_env.has_attr("task_family"):
-            raise ValueError(f"Which task of {env} the agent is for, nobody would know: pass task, or an env that has one.")
+        if isinstance(env, str):
+            with closing(gym.make(env)) as made:
+                if task is None and made.has_wrapper_attr("task_family"):
+                    raise ValueError(
+                        f"Which task of {env} the agent is for, nobody would know: pass task, or an env that has one."
+                    )
+                return self.adapt(made, n_episodes, task, explorer, deterministic, seed)
+        vec_env = self._wrap_env(env, monitor_wrapper=False)
         if vec_env.num_envs != 1:
             raise ValueError(f"adapt() adapts to one task, but the VecEnv has {vec_env.num_envs} envs: pass a single env.")
         self.check_env(vec_env)

@@ -284,8 +284,8 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
     def set_training_mode(self, mode: bool) -> None:
         # predict() asks for it at every step, and telling all modules takes longer than the actor does
         if any(module.training != mode for module in (self, self.actor, self.critic, self.encoder)):
-            super().set_training_mode(mode)
-            self.encoder.train(mode)
+            self.train(mode)  # the model of rewards, too, which SB3 knows nothing of
+            self.critic_target.eval()
 
 
 MlpPolicy = PEARLPolicy

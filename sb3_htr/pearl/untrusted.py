@@ -30,13 +30,14 @@ EXPLORERS = ("explorer", "train_explorer")
 TYPE, PICKLED = ":type:", ":serialized:"
 # How many transitions a replay buffer may have room for: it takes memory as they come, but for 8 bytes an episode
 MAX_BUFFER = 2 * 10**7
-# Arguments of PEARL that are numbers and take no memory, those that may be words, and counters
+# Arguments of PEARL that are numbers and take no memory, one that is a truth value, those that may be words, and counters
 NUMBERS = (
     *("learning_rate", "learning_starts", "batch_size", "tau", "gamma", "gradient_steps", "ent_coef", "target_entropy"),
     *("target_update_interval", "meta_batch_size", "context_size", "n_steps"),
     *("kl_coef", "final_kl_coef", "reward_coef"),
     *("n_tasks_per_rollout", "n_episodes_per_task", "buffer_size"),
 )
+FLAG = "cuda_graph"
 WORDS = {"ent_coef": LEARNT_ENT_COEF, "target_entropy": "auto", "matmul_precision": "highest|high|medium"}
 COUNTERS = ("num_timesteps", "_n_updates")
 # Arguments of the replay buffer that are plain data
@@ -71,6 +72,7 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
         check_is_ours("policy", data["policy_class"].get("__module__", ""))
         settings: dict[str, Any] = {name: _plain(name, data[name]) for name in EXPLORERS if name not in kwargs}
         settings |= {name: data[name] for name in NUMBERS if type(data.get(name)) in (int, float)}
+        settings |= {FLAG: data[FLAG]} if type(data.get(FLAG)) is bool else {}
         # A schedule may be one that is read below; no other number is an object
         for name in [name for name in NUMBERS if isinstance(data.get(name), dict) and name != "learning_rate"]:
             warnings.warn(f"{name} is in {path} as no plain number, and is left at its default.", stacklevel=2)

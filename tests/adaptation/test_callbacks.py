@@ -44,6 +44,17 @@ def test_a_training_shorter_than_the_time_between_evaluations_is_evaluated_at_it
     assert len(callback.returns) == 1
 
 
+def test_evaluations_of_another_shape_are_refused_and_no_full_disk(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    def callback(n_eval_episodes: int) -> MetaEvalCallback:
+        return MetaEvalCallback(ENV_ID, eval_freq=60, n_eval_episodes=n_eval_episodes, log_path=str(tmp_path), verbose=0)
+
+    begun = callback(2)
+    tiny_pearl().learn(ROLLOUT, callback=begun)
+    callback(2).load_state_dict(begun.state_dict())
+    with pytest.raises(ValueError, match="begun with evaluations of 2 episodes on 20 tasks, and this callback has 3 on 20"):
+        callback(3).load_state_dict(begun.state_dict())
+
+
 def test_the_last_evaluation_is_written_at_the_end_if_it_could_not_be_before(
     tiny_pearl: MakePEARL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

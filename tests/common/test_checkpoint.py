@@ -2,9 +2,11 @@
 
 import json
 import random
+import struct
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch as th
@@ -36,6 +38,21 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
         folder.mkdir()
         (folder / "other").write_text("x")
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["other"]
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (RuntimeError("[enforce fail at inline_container.cc:603] . unexpected pos 192 vs 91"), OSError),
+        (ValueError("ZIP does not support timestamps before 1980"), OSError),
+        (struct.error("'H' format requires 0 <= number <= 65535"), OSError),
+        (RuntimeError("CUDA error: an illegal memory access was encountered"), RuntimeError),
+        (ValueError("all input arrays must have the same shape"), ValueError),
+    ],
+)
+def test_a_full_disk_is_told_from_an_error_of_the_program(error: Exception, expected: Any, tmp_path: Path) -> None:
+    with pytest.raises(expected), atomic_path(tmp_path / "file"):
+        raise error
 
 
 def test_a_file_does_not_replace_a_folder(tmp_path: Path) -> None:

@@ -116,6 +116,14 @@ def test_counts_of_callbacks_of_others_go_on(tiny_pearl: MakePEARL, tmp_path: Pa
     assert stop.n_episodes == 3 and stop.max_episodes == 11 and "_on_step" not in vars(stop) and stop.model is model
 
 
+def test_what_a_callback_is_made_with_is_not_what_it_was_made_with_once() -> None:
+    """Only what it has counted goes on."""
+    before, now = StopTrainingOnMaxEpisodes(100, verbose=1), StopTrainingOnMaxEpisodes(500)
+    before.n_episodes = 7
+    restore_numbers(now, numbers_of(before))
+    assert (now.n_episodes, now.max_episodes, now.verbose) == (7, 500, 0)
+
+
 class Highest(BaseCallback):
     """Its number is one of numpy."""
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sb3_htr.common.errors import reason
+from sb3_htr.common.errors import last_line, reason
 
 
 @pytest.mark.parametrize(
@@ -11,8 +11,11 @@ from sb3_htr.common.errors import reason
         (OSError(), "OSError"),
         (ValueError(""), "ValueError"),
         (ValueError("first\n  last "), "last"),
-        (OSError(28, "full"), "full"),
     ],
 )
-def test_a_failed_write_has_a_reason(error: Exception, said: str) -> None:
-    assert reason(error) == said
+def test_an_error_has_a_last_line(error: Exception, said: str) -> None:
+    assert last_line(error) == said
+
+
+def test_a_failed_write_has_a_reason() -> None:
+    assert reason(OSError(28, "full")) == "full" and reason(OSError("first\nlast")) == "last"

@@ -174,9 +174,12 @@ def test_an_untrusted_model_acts_as_the_one_that_was_saved(tiny_pearl: MakePEARL
     assert load_untrusted(tmp_path / "model.zip", ENV_ID, explorer="prior").explorer == Prior()
     for a, b in zip(*(evaluate_adaptation(m, ENV_ID, n_episodes=3) for m in (model, loaded)), strict=True):
         np.testing.assert_array_equal(a, b)
-    tiny_pearl(ent_coef="auto_0.3", target_entropy=-1.5, matmul_precision="medium").save(tmp_path / "words.zip")
+    tiny_pearl(ent_coef="auto_0.3", target_entropy=-1.5, matmul_precision="medium", cuda_graph=False).save(
+        tmp_path / "words.zip"
+    )
     words = load_untrusted(tmp_path / "words.zip", ENV_ID)
     assert (words.ent_coef, words.target_entropy, words.matmul_precision) == ("auto_0.3", -1.5, "medium")
+    assert words.cuda_graph is False
     # What is pickled is left out
     tiny_pearl(learning_rate=lambda _: 1.0, replay_buffer_kwargs={"relabeller": EpisodeClustering(0.2)}).save(
         tmp_path / "own.zip"

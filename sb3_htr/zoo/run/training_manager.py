@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.common.checkpoint import checkpoints, load_latest
 from sb3_htr.common.checkpoint_callback import CheckpointCallback, cut_monitor_files
-from sb3_htr.common.errors import WRITE_ERRORS, reason
+from sb3_htr.common.errors import reason
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.common.versions import hardware, made_by
 from sb3_htr.pearl.divergence import DivergedError
@@ -187,7 +187,7 @@ class TrainingManager(MetaExperimentManager):
             model.save(f"{self.save_path}/{self.env_name}.zip")
             if self.save_replay_buffer and hasattr(model, "save_replay_buffer"):
                 model.save_replay_buffer(Path(self.save_path, "replay_buffer.pkl"))
-        except WRITE_ERRORS as error:
+        except OSError as error:
             again = f"`{self._to_go_on()}` goes on from the last checkpoint"
             if not checkpoints(Path(self.save_path)):
                 again = "train again, as there is no checkpoint either"
