@@ -61,7 +61,7 @@ def _select(traj: Trajectory, index: Any) -> Trajectory:
     return Trajectory(*(values[index] for values in traj))
 
 
-def _tells_rewards(family: Any) -> bool:
+def _has_reward_hooks(family: Any) -> bool:
     return any(hasattr(family, name) for name in REWARD_HOOKS)
 
 
@@ -71,7 +71,7 @@ def _check_interface(env: gym.Env[Any, Any]) -> TaskFamily:
     advice = "hide the goal of a GoalEnv with htr_envs.hide_goal, derive any other env from htr_envs.TaskEnv."
     _require(hasattr(base, "task_family"), f"The env has no `task_family`: {advice}")
     family: TaskFamily = base.task_family
-    hooks = REWARD_HOOKS if _tells_rewards(family) else ()
+    hooks = REWARD_HOOKS if _has_reward_hooks(family) else ()
     for name in ("sample_tasks", *hooks, *TASK_SETS, "task_space"):
         advice = "derive it from htr_envs.TaskFamily, and call its __init__ with the tasks."
         _require(hasattr(family, name), f"The task family has no `{name}`: {advice}")
@@ -127,7 +127,7 @@ def _check_observation(env: gym.Env[Any, Any], observation: Any, when: str) -> N
 def _check_step(env: gym.Env[Any, Any], family: TaskFamily, observation: Any, reward: Any, info: dict[str, Any]) -> None:
     _check_observation(env, observation, "a step")
     _require(isinstance(reward, float) and bool(np.isfinite(reward)), f"The reward {reward!r} is not a finite float.")
-    told = _tells_rewards(family)
+    told = _has_reward_hooks(family)
     for key in INFO_KINDS if told else ("task_id",):
         kind = INFO_KINDS[key]
         _require(key in info, f"The info of step lacks `{key}`.")
@@ -465,7 +465,7 @@ def check_task_env(env: gym.Env[Any, Any], n_episodes: int = 3, seed: int = 0) -
     """
     family = _check_interface(env)
     _check_family(family)
-    check_episode = _check_episode if _tells_rewards(family) else _check_dependent_episode
+    check_episode = _check_episode if _has_reward_hooks(family) else _check_dependent_episode
     for episode in range(n_episodes):
         check_episode(env, family, seed + episode)
     _check_task_rules(env, family)

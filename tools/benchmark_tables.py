@@ -33,6 +33,7 @@ def summary(contents: list[dict[str, Any]]) -> str:
     :return: Markdown table of the figures that had a goal, on one thread where there are several, against other libraries
     """
     lines = ["| | ours | times as fast as | |", "| --- | --- | --- | --- |"]
+    machines: list[str] = []
     for content in contents:
         for row in content.get("rows", []):
             other_library = row["against"].startswith(("SB3", "katerakelly"))
@@ -40,7 +41,10 @@ def summary(contents: list[dict[str, Any]]) -> str:
                 ours = f"{row['ours']:,.{_decimals(row['ours'])}f} {row['unit']}"
                 name = f"{content['name']}: {row['name'].removesuffix(', 1 thread(s)')}"
                 lines.append(f"| {name} | {ours} | {row['ratio']:.1f} | {row['against']} |")
-    return "\n".join(lines) + f"\n\n`make bench`, {contents[0]['machine']}.\n"
+                # Without its threads, which are those of the last row of the file
+                machines.append(content["machine"].rpartition(", ")[0])
+    where = ", and ".join(dict.fromkeys(machines))
+    return "\n".join(lines) + f"\n\n`make bench`, {where}, 1 thread(s).\n"
 
 
 def shares(content: dict[str, Any]) -> str:

@@ -165,17 +165,22 @@ def _interval(row: dict[str, Any]) -> str:
     return numbers(row, 1)
 
 
-def filled(text: str, tables: dict[str, str]) -> str:
+def filled(text: str, tables: dict[str, str], page: object = "The document") -> str:
     """
     :param text: of a document
     :param tables: what goes between ``<!-- NAME -->`` and ``<!-- end -->``, by name
+    :param page: the document, for the message
     :return: the document with it
+    :raises ValueError: if a table has no end, or the next one begins before it
     """
     for name, content in tables.items():
         start, end = f"<!-- {name} -->\n", "<!-- end -->"
         if start in text:
             before, _, after = text.partition(start)
-            text = before + start + content + end + after.partition(end)[2]
+            old, found, rest = after.partition(end)
+            if not found or "<!--" in old:
+                raise ValueError(f"{page} has no {end} of its own for {start.strip()}: add it.")
+            text = before + start + content + end + rest
     return text
 
 
@@ -185,7 +190,7 @@ def fill(documents: Iterable[Path], tables: dict[str, str]) -> None:
     :param tables: see :func:`filled`
     """
     for document in documents:
-        text = filled(document.read_text(), tables)
+        text = filled(document.read_text(), tables, document)
         with atomic_path(document) as temporary:
             temporary.write_text(text)
 

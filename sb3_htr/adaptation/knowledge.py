@@ -78,8 +78,8 @@ class LatentKnowledge(nn.Module):
         self.register_buffer("is_train", th.zeros(n, dtype=th.bool))
 
     @property
-    def tells_success(self) -> bool:
-        """Whether some rewards tell a success. In a family that has no successes, none does: the threshold is infinite."""
+    def tells_rewards(self) -> bool:
+        """Whether rewards tell a success. Those of a family without reward hooks do not: the threshold is infinite."""
         return bool(self.threshold < float("inf"))
 
     def reward_watch(self, n_envs: int) -> RewardWatch | None:
@@ -88,17 +88,17 @@ class LatentKnowledge(nn.Module):
         :return: what notices rewards unlike those of meta-training; None if no task was solved there by which one could
         """
         n, threshold = int(self.n_particles), self.threshold.item()
-        if not self.tells_success or n == 0:
+        if not self.tells_rewards or n == 0:
             return None
         # The threshold is in the middle, and is known before the model of rewards has learned what a success is worth
         return RewardWatch(n_envs, threshold, max(2 * threshold, self.gain[:n, :n].max().item()))
 
-    def set_tells_success(self, tells_success: bool) -> None:
+    def set_tells_rewards(self, tells_rewards: bool) -> None:
         """
-        :param tells_success: whether the task family has successes
+        :param tells_rewards: whether the task family tells rewards and successes
         """
-        if tells_success != self.tells_success:
-            self.threshold.fill_(INITIAL_THRESHOLD if tells_success else float("inf"))
+        if tells_rewards != self.tells_rewards:
+            self.threshold.fill_(INITIAL_THRESHOLD if tells_rewards else float("inf"))
 
     def learn(self, policy: ContextualPolicy, means: th.Tensor, bank: TaskBank, gamma: float) -> None:
         """

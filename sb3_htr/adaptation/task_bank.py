@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 
-from sb3_htr.common.checks import missing_hook
+from sb3_htr.common.checks import tells_rewards
 from sb3_htr.common.random_state import get_generator_state, set_generator_state, stream
 from sb3_htr.common.task_reward import ROUNDING
 from sb3_htr.common.type_aliases import TaskFamily
@@ -91,7 +91,7 @@ class TaskBank:
     def update(self) -> None:
         """Take in the new episodes."""
         new, self.new = [episode for _, episode in self.new], []
-        if missing_hook(self.task_family) is not None:
+        if not tells_rewards(self.task_family):
             return
         size = max(min(CHUNK, CHUNK_STEPS // max(map(len, new), default=1)), 1)
         for start in range(0, len(new), size):

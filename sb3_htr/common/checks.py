@@ -202,6 +202,14 @@ def missing_hook(family: TaskFamily) -> str | None:
     return next((name for name in ("compute_reward", "is_success", "hindsight_task") if not hasattr(family, name)), None)
 
 
+def tells_rewards(family: TaskFamily) -> bool:
+    """
+    :param family: of an env
+    :return: whether it tells rewards and successes of any step under any task
+    """
+    return missing_hook(family) is None
+
+
 def check_has_hooks(family: TaskFamily) -> None:
     """
     :param family: of an env

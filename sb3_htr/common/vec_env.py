@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_htr.common.checks import check_has_task_family, check_tasks, missing_hook
+from sb3_htr.common.checks import check_has_task_family, check_tasks, tells_rewards
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.vec_wrappers import PatientResultsWriter, TaskVecMonitor
 
@@ -204,8 +204,8 @@ def make_task_vec_env(
         vector_env = gym.make_vec(env_id, n_envs, vectorization_mode="vector_entry_point", **env_kwargs)
         check_has_task_family(hasattr(vector_env, "task_family"))
         venv = BatchedTaskVecEnv(vector_env)
-    tells_success = missing_hook(venv.get_attr("task_family", [0])[0]) is None
-    monitored = TaskVecMonitor(venv, info_keywords=("is_success",) if tells_success else ())
+    family = venv.get_attr("task_family", [0])[0]
+    monitored = TaskVecMonitor(venv, info_keywords=("is_success",) if tells_rewards(family) else ())
     if monitor_dir is not None:
         header: dict[str, Any] = {"t_start": monitored.t_start, "env_id": env_id}
         monitored.results_writer = PatientResultsWriter(os.path.join(monitor_dir, "0"), header, monitored.info_keywords)

@@ -1,6 +1,7 @@
 """``sb3-htr experiment``: repeat experiments of this project, all their runs, tables and pictures."""
 
 import argparse
+import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -88,13 +89,14 @@ def main(argv: Sequence[str]) -> None:
 
 def _command(args: argparse.Namespace, cells: Sequence[Cell], output: Path, earlier: Sequence[Path]) -> str:
     """What repeats all runs of an experiment."""
-    how = ("--quick " if args.quick else "") + f"--seeds {len({cell.seed for cell in cells})}"
-    how += f" --gym-packages {' '.join(args.gym_packages)}" if args.gym_packages else ""
-    how += f" --device {args.device}" if args.device != "cpu" else ""
+    words = ["sb3-htr", "experiment", cells[0].experiment, *["--quick"] * args.quick]
+    words += ["--seeds", str(len({cell.seed for cell in cells}))]
+    words += ["--gym-packages", *args.gym_packages] if args.gym_packages else []
+    words += ["--device", args.device] if args.device != "cpu" else []
     # Those of its own folder are runs of the experiment, made by this command before
     others = [str(folder) for folder in earlier if folder.resolve() != output.resolve()]
-    how += f" --with-results {' '.join(others)}" if others else ""
-    return f"sb3-htr experiment {cells[0].experiment} {how}"
+    words += ["--with-results", *others] if others else []
+    return shlex.join(words)
 
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:

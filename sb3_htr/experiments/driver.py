@@ -9,6 +9,7 @@ from datetime import timedelta
 from pathlib import Path
 
 from sb3_htr.experiments.cell import Cell
+from sb3_htr.experiments.executors import HOPELESS
 from sb3_htr.experiments.storage import storage_at
 
 # Failures of a cell without a new checkpoint in between, after which it is given up
@@ -79,13 +80,14 @@ class Driver:
         total, now = sum(cell.n_timesteps for cell in self.cells), time.monotonic()
         left = self._n_steps_left(todo)
         given_up = self._n_steps_left([cell for cell in self.cells if cell.label in self.failed])
-        start, before = self._start = self._start or (now, left)
+        done = total - left - given_up
+        start, before = self._start = self._start or (now, done)
         n_running = sum(self.runs.is_claimed(cell) for cell in todo)
         parts = [f"{len(self.cells) - len(todo) - len(self.failed)} of {len(self.cells)} cells done", f"{n_running} running"]
         parts += [f"{len(self.failed)} failed"] if self.failed else []
-        parts += [f"{100 * (total - left - given_up) // max(total, 1)} % of the env steps"]
-        if left < before:
-            parts += [f"{timedelta(seconds=round(left * (now - start) / (before - left)))} left"]
+        parts += [f"{100 * done // max(total, 1)} % of the env steps"]
+        if done > before:
+            parts += [f"{timedelta(seconds=round(left * (now - start) / (done - before)))} left"]
         return ", ".join(parts)
 
     def _n_steps_left(self, cells: Sequence[Cell]) -> int:
@@ -115,18 +117,19 @@ class Driver:
         self.runs.look([cell])
         if isinstance(error, Exception):
             # Ray's text is a traceback, with the error at its end
-            self._fail(cell, f"{type(error).__name__}: {error}".strip().splitlines()[-1])
+            self._fail(cell, f"{type(error).__name__}: {error}".strip().splitlines()[-1], isinstance(error, HOPELESS))
         elif error is not None:  # of this process alone: it, or a callback of its training, was told to stop
             print(f"{cell.label} was interrupted, and is left where it is.", file=sys.stderr, flush=True)
             self.failed[cell.label] = "it was interrupted"
         elif future.result() and not (self.runs.is_finished(cell) or self.runs.is_claimed(cell)):
             self._fail(cell, f"its node has a result that is not in {self.runs} here: give --runs that all nodes see.")
 
-    def _fail(self, cell: Cell, reason: str) -> None:
+    def _fail(self, cell: Cell, reason: str, hopeless: bool = False) -> None:
         at = cell.label, self.runs.n_steps(cell)
         self._failures[at] += 1
-        given_up = self._failures[at] == ATTEMPTS
-        what = f"failed {ATTEMPTS} times" if given_up else "failed, and is tried again"
+        n_failures = self._failures[at]
+        given_up = hopeless or n_failures == ATTEMPTS
+        what = "failed" + (f" {n_failures} times" * (n_failures > 1) if given_up else ", and is tried again")
         print(f"{cell.label} {what} at {at[1]:,} env steps: {reason}", file=sys.stderr, flush=True)
         if given_up:
             self.failed[cell.label] = f"{what}: {reason}"

@@ -12,11 +12,16 @@ from threading import Lock, Thread
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
+from sb3_htr.pearl.divergence import DivergedError
+
 T = TypeVar("T")
 # Of a GPU, for a run: five were trained side by side on one, docs/performance.md
 GPU_SHARE = 0.2
 # Seconds: a node on which calls fail sooner, as where a disk is full, is kept busy so long, or it would take the whole queue
 FAST = 60.0
+# Failures of the cell, which come again wherever it is tried. A ValueError, as of a wrong setting, may be of the node alone: a
+# GPU that is busy, a file that is torn there, another version of a package
+HOPELESS = (DivergedError,)
 
 
 class SerialExecutor(Executor):
@@ -147,6 +152,8 @@ def _call(fn: Callable[..., T], *args: Any, **kwargs: Any) -> T:
     start = time.monotonic()
     try:
         return fn(*args, **kwargs)
+    except HOPELESS:
+        raise
     except Exception:
         time.sleep(max(FAST - (time.monotonic() - start), 0))
         raise

@@ -1,6 +1,7 @@
 """How every final model is judged: on test tasks that decided nothing, with several seeds, by each explorer alike."""
 
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from functools import partial
 from typing import Any
 
@@ -63,7 +64,8 @@ def check_evaluations(cell: Cell, trained_with: Any = None) -> None:
 
 def _evaluate_by(evaluation: Evaluation, cell: Cell, model: Model, trained_with: Any) -> KwArgs:
     env_kwargs = {**cell.env_kwargs, **evaluation.tested_on}
-    family = get_task_family(make_task_vec_env(cell.env_id, env_kwargs=env_kwargs))
+    with closing(make_task_vec_env(cell.env_id, env_kwargs=env_kwargs)) as single:
+        family = get_task_family(single)
     env = make_task_vec_env(cell.env_id, len(family.test_tasks), env_kwargs=env_kwargs)
     explorer = _explorer(evaluation.explorer, trained_with)
     records = [

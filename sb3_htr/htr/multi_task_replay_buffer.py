@@ -9,7 +9,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 
-from sb3_htr.common.checks import check_has_hooks, missing_hook
+from sb3_htr.common.checks import check_has_hooks, tells_rewards
 from sb3_htr.common.family_facts import check_same_family, family_facts
 from sb3_htr.common.random_state import get_generator_state, set_generator_state, stream
 from sb3_htr.common.settings import check_numbers, make
@@ -132,7 +132,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
     @property
     def tells_rewards(self) -> bool:
         """Whether the task family tells rewards and successes of any step under any task."""
-        return missing_hook(self.task_family) is None
+        return tells_rewards(self.task_family)
 
     @property
     def n_tasks(self) -> int:
@@ -307,7 +307,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         :raises ValueError: if it tells others than were stored
         """
         index, columns = episodes.index(), self.transitions
-        if len(index.rows) == 0 or missing_hook(family) is not None:
+        if len(index.rows) == 0 or not tells_rewards(family):
             return
         rewarded = np.flatnonzero(np.repeat(self.rewarded(episodes), np.diff(index.episode_row)))
         # Not drawn: as many random numbers are to follow as without

@@ -60,7 +60,7 @@ class MetaTest(SAC):
         """
         own = to_explorer(self.explorer)
         chosen = own if explorer in (None, own.name) else to_explorer(explorer)
-        self._check_explorer(chosen, self.knowledge.tells_success)
+        self._check_explorer(chosen, self.knowledge.tells_rewards)
         check_numbers(n_envs=(n_envs, 1))
         self.policy.set_training_mode(False)
         return Adaptation(
@@ -130,7 +130,7 @@ class MetaTest(SAC):
                 returns[episode] += step.rewards[0]
                 # Some envs give a number
                 successes[episode] |= bool(step.infos[0].get("is_success", adaptation.task_reward[0] > 0))
-        if adaptation.best_return[0] <= 0 and self.knowledge.tells_success:
+        if adaptation.best_return[0] <= 0 and self.knowledge.tells_rewards:
             warnings.warn(
                 f"No reward was found in {n_episodes} episodes, so the agent is not adapted: allow more, or train longer. If "
                 "there was a success, its reward is on another scale than in meta-training: the most rewarded step returned "
@@ -172,8 +172,8 @@ class MetaTest(SAC):
         return given
 
     @staticmethod
-    def _check_explorer(explorer: Explorer, tells_success: bool) -> None:
-        if explorer.needs_success and not tells_success:
+    def _check_explorer(explorer: Explorer, tells_rewards: bool) -> None:
+        if explorer.needs_success and not tells_rewards:
             raise ValueError(
                 f"The explorer {explorer.name!r} goes by successes, of which the env's task_family tells nothing: pass "
                 "explorer='prior' (and in a training train_explorer='prior', on the command line --method pearl-sparse-prior)."

@@ -247,9 +247,9 @@ class OffPolicyMetaAlgorithm(MetaTest, ReplayFiles, CheckedFiles, SAC):
     def _introduce_policy(self) -> None:
         if self.replay_buffer is not None:
             self.replay_buffer.relabeller.policy = self.policy
-            self.knowledge.set_tells_success(self.replay_buffer.tells_rewards)
+            self.knowledge.set_tells_rewards(self.replay_buffer.tells_rewards)
             for explorer in (self.explorer, self.train_explorer):
-                self._check_explorer(explorer, self.knowledge.tells_success)
+                self._check_explorer(explorer, self.knowledge.tells_rewards)
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
@@ -374,7 +374,7 @@ class OffPolicyMetaAlgorithm(MetaTest, ReplayFiles, CheckedFiles, SAC):
             )
         self._check_rollouts()
         # The weights of a file may be of a family without successes
-        self.knowledge.set_tells_success(self.replay_buffer.tells_rewards)
+        self.knowledge.set_tells_rewards(self.replay_buffer.tells_rewards)
         return super()._setup_learn(*args, **kwargs)
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:

@@ -233,7 +233,7 @@ def test_evaluations_that_could_not_be_made_are_refused_before_the_training(tiny
     model = tiny_pearl()
     with pytest.raises(ValueError, match="Observation spaces do not match"):
         model.learn(ROLLOUT, MetaEvalCallback("SparseTargetSpeed-v0"))
-    model.knowledge.set_tells_success(False)
+    model.knowledge.set_tells_rewards(False)
     with pytest.raises(ValueError, match="explorer 'aggregate' goes by successes"):
         MetaEvalCallback(ENV_ID, explorer="aggregate").init_callback(model)
     assert model.num_timesteps == 0

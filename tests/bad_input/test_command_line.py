@@ -100,3 +100,24 @@ def test_a_settings_file_that_is_none(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_half_a_trial_is_refused(trial: list[str], tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="A trial is named by --storage, --study-name, --trial-id, from 0 on: add --"):
         main(["train", "--env", ENV_ID, "-f", str(tmp_path), *trial])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["-n", "0"], "--n-timesteps is 0, expected a whole number of at least 1"),
+        (["--n-timesteps", "-5"], "--n-timesteps is -5, expected a whole number of at least 1"),
+        (["--fps", "0"], r"--fps is 0\.0, expected a number of at least 0\.1"),
+        (["--fps", "-3"], r"--fps is -3\.0, expected a number of at least 0\.1"),
+        (["--fps", "inf"], "--fps is inf, expected a number of at least"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_what_cannot_be_shown_is_refused_before_it_begins(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for command in ("enjoy", "record"):
+        if (command, arguments[0]) != ("record", "--fps"):
+            with pytest.raises(ValueError, match=message):
+                main([command, "--env", ENV_ID, "-f", "nowhere", *arguments])
+    assert not capsys.readouterr().out

@@ -1,17 +1,23 @@
 """The reliability diagram compares what the reward model says with what happened."""
 
+from functools import partial
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.vec_env import VecEnv
 
 from helpers import ENV_ID
 from htr_envs.point_robot import PointRobotDynamics
 from sb3_htr import PEARL
 from sb3_htr.common.type_aliases import Context
 from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.experiments import calibration as calibration_module
+from sb3_htr.experiments import protocol
 from sb3_htr.experiments.calibration import N_BINS, calibration, expected_calibration_error
+from sb3_htr.experiments.grid import Experiment, Variant
 from sb3_htr.rivals.scripted import ScriptedAgent
 
 
@@ -73,6 +79,22 @@ def test_the_context_of_a_task_is_that_of_its_adaptation(monkeypatch: pytest.Mon
     # After those of the adaptation, one of each task that was solved
     n_solved = round(bins[:, 0].sum() / (6 * 3 * 20))
     assert n_solved and all(context.rewards.max() > 0 for context in seen[-n_solved:])
+
+
+@pytest.mark.parametrize("module", [calibration_module, protocol])
+def test_no_env_stays_open(module: ModuleType, model: PEARL, monkeypatch: pytest.MonkeyPatch) -> None:
+    made, closed = list[VecEnv](), list[VecEnv]()
+
+    def noting(*args: Any, **kwargs: Any) -> VecEnv:
+        made.append(make_task_vec_env(*args, **kwargs))
+        monkeypatch.setattr(made[-1], "close", partial(closed.append, made[-1]))
+        return made[-1]
+
+    monkeypatch.setattr(module, "make_task_vec_env", noting)
+    few = {"n_validation_tasks": 2, "n_test_tasks": 2}
+    (cell,) = Experiment("toy", "", ENV_ID, 1000, (Variant("htr-ser", env_kwargs=few),), 1, n_episodes=1).cells()
+    protocol.evaluate(cell, model, None, lambda name, make: make())
+    assert made and len(closed) == len(made)
 
 
 def test_a_model_that_solves_nothing_has_no_diagram(model: PEARL) -> None:

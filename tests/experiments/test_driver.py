@@ -24,6 +24,7 @@ from sb3_htr.experiments.executors import Processes, SerialExecutor
 from sb3_htr.experiments.grid import EXPERIMENTS, Experiment, Variant
 from sb3_htr.experiments.runner import lock_of, run_cell
 from sb3_htr.experiments.storage.folder import SharedFolder
+from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.zoo.cli import main
 
 CELLS = Experiment("toy", "", "SparsePointRobot-v0", 1000, (Variant("htr-ser"), Variant("htr-ec", "K = 0.8")), 3).cells()
@@ -113,6 +114,24 @@ def test_failures_are_tried_again_from_where_they_were_and_reported(
     assert log.count("a hint") == ATTEMPTS and "RuntimeError: no luck" in log
 
 
+def test_a_training_that_diverged_is_given_up_at_once(
+    trains: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without a wait for its node, which is not at fault."""
+
+    def work(cell: Cell, folder: Path) -> None:
+        raise DivergedError("critic_loss is nan")
+
+    trained = trains(work)
+    monkeypatch.setattr(time, "sleep", lambda seconds: pytest.fail("It waits."))
+    with pytest.raises(DivergedError):
+        executors._call(run_cell, CELLS[0], tmp_path)
+    with pytest.raises(ValueError, match=r"1 of 1 cells failed .*-seed1: failed: DivergedError: critic_loss is nan"):
+        Driver(CELLS[:1], tmp_path, SerialExecutor()).run()
+    assert len(trained) == 2
+    assert "htr-ser-seed1 failed at 0 env steps: DivergedError: critic_loss" in capsys.readouterr().err
+
+
 def test_what_was_given_up_here_and_done_elsewhere_is_no_failure(trains: Any, tmp_path: Path) -> None:
     def work(cell: Cell, folder: Path) -> None:
         if trained.count(cell.name) == ATTEMPTS:
@@ -138,9 +157,18 @@ def test_progress_counts_cells_and_env_steps(tmp_path: Path, monkeypatch: pytest
         # The last rollout goes beyond the budget, and the evaluation is still to come
         (running.run_folder(tmp_path) / "htr-ec/run_1/checkpoints/1200_steps").mkdir()
         assert driver.line(driver.todo()) == "1 of 6 cells done, 1 running, 33 % of the env steps, 0:02:00 left"
-    # What was given up is not done
+    # What was given up is neither done nor left
     driver.failed[CELLS[2].label] = "no luck"
-    assert "1 of 6 cells done, 0 running, 1 failed, 33 % of the env steps" in driver.line(driver.todo())
+    assert driver.line(driver.todo()) == "1 of 6 cells done, 0 running, 1 failed, 33 % of the env steps, 0:01:30 left"
+
+
+def test_what_is_given_up_brings_the_end_no_nearer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    driver = Driver(CELLS, tmp_path, SerialExecutor())
+    driver.line(driver.todo())
+    now = time.monotonic() + 60
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    driver.failed |= {cell.label: "no luck" for cell in CELLS[:3]}
+    assert driver.line(driver.todo()) == "0 of 6 cells done, 0 running, 3 failed, 0 % of the env steps"
 
 
 def test_a_node_that_sees_another_folder_is_found_out(trains: Any, tmp_path: Path) -> None:

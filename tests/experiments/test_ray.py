@@ -17,9 +17,10 @@ import torch as th
 from helpers.runs import OF_CELL
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.driver import Driver
-from sb3_htr.experiments.executors import Ray, SerialExecutor
+from sb3_htr.experiments.executors import HOPELESS, Ray, SerialExecutor
 from sb3_htr.experiments.grid import Experiment, Variant, by
 from sb3_htr.experiments.runner import find_finished, run_cell
+from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.zoo.run.record import RECORD
 
 SLOWER = {**OF_CELL, "gradient_steps": 20}
@@ -62,6 +63,13 @@ def test_a_call_is_a_task_of_one_cpu_in_a_process_of_its_own(
     assert asked == ["auto", {"num_cpus": 1, "num_gpus": n_gpus, "max_calls": 1, "max_retries": 0}, "shutdown"]
     with pytest.raises(ConnectionError, match=r"No Ray cluster answers at 127.0.0.1:1 .*: start one with `ray start --head`"):
         Ray("127.0.0.1:1")
+
+
+def test_an_error_of_a_call_keeps_its_kind() -> None:
+    """By which the driver tells what need not be tried again."""
+    exceptions = pytest.importorskip("ray.exceptions")
+    of_ray = exceptions.RayTaskError("_call", "traceback", DivergedError("critic_loss is nan"), "title", 1, "127.0.0.1")
+    assert isinstance(of_ray.as_instanceof_cause(), HOPELESS)
 
 
 @pytest.fixture

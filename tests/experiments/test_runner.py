@@ -397,6 +397,11 @@ def test_one_command_runs_several_experiments(tmp_path: Path, monkeypatch: pytes
     assert len(queue) == 4, "nothing was trained again"
     summary = json.loads(Path("again", "far", "summary.json").read_text())
     assert summary["command"] == "sb3-htr experiment far --seeds 1 --with-results both/far"
+    Path("both").rename("all of both")
+    again = ["-o", "once more", "--runs", "elsewhere", "--with-results", "all of both/far"]
+    assert main(["experiment", "far", *again]) == 0
+    summary = json.loads(Path("once more", "summary.json").read_text())
+    assert summary["command"] == "sb3-htr experiment far --seeds 1 --with-results 'all of both/far'"
     with pytest.raises(ValueError, match=r"near has no run of near: expected raw-METHOD.npz"):
         main(["experiment", "near", "far", "--runs", "third", "--with-results", "both/near"])
 

@@ -1,8 +1,11 @@
 """Tables of the documents, from results that are made up."""
 
+from pathlib import Path
 from typing import Any
 
-from tables import rivals
+import pytest
+from benchmark_tables import summary
+from tables import fill, rivals
 
 
 def test_rivals_are_compared_with_the_first_method() -> None:
@@ -23,3 +26,27 @@ def test_rivals_are_compared_with_the_first_method() -> None:
         ["slow", "`own`", "1,000", "50% [40%, 50%]", "", "≥ 3.0 [2.0, ∞), 1 of 5 never"],
         ["untimed", "`own`", "1,000", "20% [10%, 20%]"],
     ]
+
+
+@pytest.mark.parametrize("after", ["old\n", "old\n<!-- two -->\n<!-- end -->\n"], ids=["of the page", "of another block"])
+def test_a_block_without_an_end_does_not_take_that_of_another(after: str, tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(text := f"<!-- one -->\n{after}the rest\n")
+    with pytest.raises(ValueError, match=r"page\.md has no <!-- end --> of its own for <!-- one -->: add it"):
+        fill([page], {"one": "new\n"})
+    assert page.read_text() == text
+
+
+def test_the_summary_of_benchmarks_names_the_machines_of_its_rows() -> None:
+    def content(name: str, machine: str, goal: float | None) -> dict[str, Any]:
+        row = {"name": "one", "unit": "ms", "ours": 2.0, "ratio": 3.0, "goal": goal, "against": "SB3's own"}
+        return {"name": name, "machine": machine, "rows": [row]}
+
+    def origin(*contents: dict[str, Any]) -> str:
+        return summary(list(contents)).splitlines()[-1]
+
+    here = content("a", "A, 2 cores, 1 thread(s)", 1.0), content("b", "A, 2 cores, 2 thread(s)", 1.0)
+    elsewhere = content("c", "B, 4 cores, 1 thread(s)", 1.0)
+    unshown = content("d", "C, 1 cores, 1 thread(s)", None)
+    assert origin(unshown, *here) == "`make bench`, A, 2 cores, 1 thread(s)."
+    assert origin(*here, elsewhere) == "`make bench`, A, 2 cores, and B, 4 cores, 1 thread(s)."

@@ -2,7 +2,9 @@
 
 import ast
 import json
+import math
 import re
+import shlex
 import shutil
 import sys
 import zipfile
@@ -12,10 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+import yaml
 from stable_baselines3.common.utils import LinearSchedule
 
 import sb3_htr
-from helpers import ENV_ID, MakePEARL
+from helpers import ENV_ID, TINY, MakePEARL
 from helpers.runs import NOWHERE, SHIPPED, make_run, run_folder
 from sb3_htr import PEARL, load_untrusted
 from sb3_htr.adaptation.evaluation import AdaptationRecord, record_adaptation
@@ -26,8 +29,9 @@ from sb3_htr.zoo import cli
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run import model_card
 from sb3_htr.zoo.run.agents import agent_at, agent_for
-from sb3_htr.zoo.run.record import RECORD, command_to_go_on
-from sb3_htr.zoo.run.shipped import shipped
+from sb3_htr.zoo.run.method import get_method
+from sb3_htr.zoo.run.record import RECORD, command_to_go_on, read_record
+from sb3_htr.zoo.run.shipped import hyperparams_file, shipped
 from sb3_htr.zoo.run.train_arguments import training_facts
 
 
@@ -256,8 +260,8 @@ def test_an_explorer_named_by_its_record_is_the_agents_own(explorer: Any, tmp_pa
 def test_the_command_of_a_record_is_that_of_any_machine(defaults: list[str]) -> None:
     """What the trained agent was trained by, without local folders and settings, and with the seed that was drawn."""
     arguments = ["--algo", "pearl", "-conf", "/home/me/pearl.yml", "--num-threads", "1", *defaults]
-    study = ["--storage", "postgresql://me:secret@db/x", "--study-name=x", "--trial-id", "7", "--tensorboard-log=/home/me/tb"]
-    arguments += [*study, "-conf", "/home/me/my.yml", "-i", "/home/me/agent.zip"]
+    study = ["--storage", "postgresql://me:secret@db/x", "--study-name=x", "--tensorboard-log=/home/me/tb"]
+    arguments += [*study, "-i", "/home/me/agent.zip"]
     arguments += ["--env", ENV_ID, "-f", "/home/me/runs", "-P", "--seed", "3", "-params", "policy_kwargs:{'latent_dim': 3}"]
     command = model_card.training_command({"arguments": arguments, "seed": 4, "method": "htr-ec"})
     params = "-params 'policy_kwargs:{'\"'\"'latent_dim'\"'\"': 3}'"
@@ -266,7 +270,7 @@ def test_the_command_of_a_record_is_that_of_any_machine(defaults: list[str]) -> 
 
 def test_joined_arguments_keep_folders_to_themselves() -> None:
     """rl_zoo3 takes an option and its value in one word, too."""
-    arguments = [f"--env={ENV_ID}", "-f/home/me/runs", "-tb=/home/me/tb", "-i/home/me/agent.zip", "-conf=/home/me/my.yml"]
+    arguments = [f"--env={ENV_ID}", "-f/home/me/runs", "-tb=/home/me/tb", "-i/home/me/agent.zip"]
     command = model_card.training_command({"arguments": [*arguments, "--seed=3"], "seed": 4, "method": "htr-ec"})
     assert command == f"sb3-htr train --env {ENV_ID} -i agent.zip --method htr-ec --seed 4"
     assert training_facts({}, arguments) == training_facts({}, ["-i", "/home/me/agent.zip"])
@@ -279,16 +283,73 @@ def test_a_command_to_go_on_names_what_it_needs() -> None:
 
 
 def test_a_record_may_end_with_an_option() -> None:
-    command = model_card.training_command({"arguments": ["-conf"], "seed": 4, "method": "htr-ec"})
+    command = model_card.training_command({"arguments": ["-f"], "seed": 4, "method": "htr-ec"})
     assert command == "sb3-htr train --method htr-ec --seed 4"
 
 
-@pytest.mark.parametrize("file", ["pearl_prior.yml", "hyperparams/pearl_prior.yml"])
+@pytest.mark.parametrize("file", ["pearl_prior.yml", str(hyperparams_file("pearl_prior.yml").resolve())])
 @pytest.mark.parametrize("option", ["-conf", "--conf-file"])
 def test_the_command_of_a_record_names_settings_that_everybody_has(file: str, option: str) -> None:
     arguments = ["--env", ENV_ID, option, file]
     command = model_card.training_command({"arguments": arguments, "seed": 4, "method": "htr-ser-prior"})
     assert command == f"sb3-htr train --env {ENV_ID} {option} pearl_prior.yml --method htr-ser-prior --seed 4"
+
+
+def test_the_command_of_a_run_by_a_file_of_ones_own_trains_the_same_agent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Though its name be that of the package's."""
+    monkeypatch.chdir(tmp_path)
+    block: dict[str, Any] = {key: value for key, value in TINY.items() if key not in ("seed", "gradient_steps")}
+    block |= {"policy": "MlpPolicy", "n_timesteps": 480, "n_envs": 4, "env_kwargs": {"goal_distance": 0.3}}
+    Path("hyperparams").mkdir()
+    Path("hyperparams/pearl.yml").write_text(yaml.safe_dump({ENV_ID: block}))
+    arguments = ["train", "--env", ENV_ID, "--eval-freq", "-1", "--seed", "3", "-conf", "hyperparams/pearl.yml"]
+    assert main([*arguments, "-params", "gradient_steps:2", "explorer:'prior'"]) == 0
+    record = read_record(run_folder(Path("logs")) / RECORD)
+    command = model_card.training_command(record)
+    shutil.rmtree("hyperparams")
+    assert main([*shlex.split(command)[1:], "-f", "again"]) == 0
+    assert read_record(run_folder(Path("again")) / RECORD)["hyperparams"] == record["hyperparams"]
+    first, second = (PEARL.load(run_folder(Path(folder)) / f"{ENV_ID}.zip") for folder in ("logs", "again"))
+    assert all(th.equal(a, b) for a, b in zip(first.policy.parameters(), second.policy.parameters(), strict=True))
+
+
+def settings_of_package() -> dict[str, Any]:
+    block = yaml.safe_load(hyperparams_file("pearl.yml").read_text())["default"]
+    return get_method("htr-ser").settings(block)
+
+
+def test_the_command_of_a_trial_has_what_the_trial_had() -> None:
+    """Whoever has the study. What -params gave is among it."""
+    arguments = ["--env", ENV_ID, "-params", "gamma:0.9", "n_envs:20", "-n", "480", "--storage", "x.log", "--study-name", "x"]
+    found = {"n_timesteps": 480, "learning_rate": "lin_0.002", "gamma": 0.9, "policy_kwargs": {"latent_dim": 3}}
+    record = {"arguments": [*arguments, "--trial-id", "7"], "seed": 4, "method": "htr-ser", "env_id": ENV_ID}
+    command = model_card.training_command({**record, "hyperparams": {**settings_of_package(), **found}})
+    params = ["learning_rate:'lin_0.002'", "gamma:0.9", "policy_kwargs:{'latent_dim': 3}"]
+    expected = ["sb3-htr", "train", "--env", ENV_ID, "-n", "480", "--method", "htr-ser", "-params", *params, "--seed", "4"]
+    assert shlex.split(command) == expected
+
+
+@pytest.mark.parametrize(
+    "otherwise",
+    [
+        {"policy_kwargs": {"activation_fn": str(th.nn.Tanh)}},
+        {"replay_buffer_kwargs": {"relabel_probability": math.inf}},
+        {"n_envs": None},
+    ],
+)
+def test_settings_that_no_command_has_are_in_the_card_alone(otherwise: dict[str, Any]) -> None:
+    """A class of one's own, a number without a literal, and a setting of the package's file that one's own leaves out."""
+    hyperparams = {**settings_of_package(), **otherwise}
+    hyperparams = {key: value for key, value in hyperparams.items() if value is not None}
+    record = {"env_id": ENV_ID, "env_kwargs": {}, "gym_packages": [], "num_timesteps": 240, "model": "last", "seed": 4}
+    record |= {"arguments": ["--env", ENV_ID, "-conf", "/home/me/pearl.yml"], "method": "htr-ser", "hyperparams": hyperparams}
+    record["command"] = model_card.training_command(record)
+    assert record["command"] == ""
+    adapted = AdaptationRecord(np.ones((2, 3)), np.ones((2, 3), dtype=bool), np.zeros((2, 3, 1, 1), dtype=np.float32))
+    card = model_card.model_card(record, {"belief": adapted})
+    assert "## Training\n\nThe model after 240 env steps (last)." in card and "sb3-htr train" not in card
 
 
 def test_a_card_names_all_modules_of_ones_own_at_once() -> None:

@@ -94,12 +94,75 @@ def test_a_study_is_of_one_env_and_one_method(quick: None, tmp_path: Path) -> No
     assert search(tmp_path, storage, n_trials=1) == 0
     with pytest.raises(ValueError, match="The study 'test' is of method htr-ser, and not htr-ec: give --method as there"):
         search(tmp_path, storage, method="htr-ec")
-    for more, known in ((["-n", "960"], "n-timesteps 480"), (["--env-kwargs", "goal_distance:9.0"], "env-kwargs {'goal_")):
-        with pytest.raises(ValueError, match=f"The study 'test' is of {known}"):
+    others = {
+        r"{'n_timesteps': 480}, and not {'n_timesteps': 960}: give -conf, -params, -n and --env-kwargs": ["-n", "960"],
+        r"{'env_kwargs': {'goal_distance': 0\.1}}, and not {'env_kwargs': {'goal": ["--env-kwargs", "goal_distance:9.0"],
+    }
+    for known, more in others.items():
+        with pytest.raises(ValueError, match=f"The study 'test' is of settings {known}"):
             search(tmp_path, storage, *more)
     trained = ["train", "--env", ENV_ID, "--method", "pearl-sparse", "-f", str(tmp_path), "--storage", storage]
     with pytest.raises(ValueError, match="The study 'test' is of method htr-ser, and not pearl-sparse"):
         main([*trained, "--study-name", "test", "--trial-id", "0"])
+
+
+@pytest.fixture
+def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Trials train nothing."""
+    monkeypatch.setattr(SearchManager, "objective", lambda *_: 1.0)
+
+
+def join(folder: Path, *more: str) -> int:
+    """One worker of a study, with settings of a file."""
+    arguments = ["optimize", "--env", ENV_ID, "-f", str(folder), "--n-trials", "1", "--verbose", "0"]
+    return main([*arguments, "--storage", f"{folder}/study.log", "--study-name", "test", "-conf", f"{folder}/my.yml", *more])
+
+
+def write_settings(folder: Path, **settings: Any) -> None:
+    block = {"policy": "MlpPolicy", "n_timesteps": 480.0, "n_envs": 4, **settings}
+    (folder / "my.yml").write_text(yaml.safe_dump({ENV_ID: block}))
+
+
+def test_workers_share_a_study_however_its_settings_are_spelled(at_once: None, tmp_path: Path) -> None:
+    """But not with other settings in the file, nor with some that others search."""
+    write_settings(tmp_path, gamma=0.9)
+    assert join(tmp_path, "--env-kwargs", "goal_distance:0.1", "n_test_tasks:3") == 0
+    reordered = ["--env-kwargs", "n_test_tasks:3", "goal_distance:0.1"]
+    assert join(tmp_path, "-n", "480", *reordered) == 0
+    with pytest.raises(
+        ValueError, match=r"is of settings {'not searched': \[\]}, and not {'not searched': \['gamma'\]}: give"
+    ):
+        join(tmp_path, *reordered, "-params", "gamma:0.9")
+    write_settings(tmp_path, gamma=0.9, tau=0.1)
+    with pytest.raises(ValueError, match=r"The study 'test' is of settings {}, and not {'tau': 0\.1}: give -conf"):
+        join(tmp_path, *reordered)
+
+
+def test_a_study_of_an_earlier_version_goes_on(at_once: None, tmp_path: Path) -> None:
+    """It says its settings otherwise, and from then on as others do."""
+    write_settings(tmp_path)
+    study = optimize.create_study(f"{tmp_path}/study.log", "test")
+    said = {"env": ENV_ID, "method": "htr-ser", "env-kwargs": "{}", "n-timesteps": "-1", "hyperparams": "{}"}
+    for fact, value in said.items():
+        study.set_user_attr(fact, value)
+    assert join(tmp_path, "-n", "480") == 0
+    with pytest.raises(ValueError, match="is of settings"):
+        join(tmp_path, "-n", "960")
+
+
+def test_a_mistyped_setting_leaves_the_study_to_others(at_once: None, tmp_path: Path) -> None:
+    write_settings(tmp_path)
+    with pytest.raises(ValueError, match="gama"):
+        join(tmp_path, "-params", "gama:0.5")
+    assert join(tmp_path, "-params", "gamma:0.5") == 0
+
+
+@pytest.mark.parametrize("n_jobs", ["2", "-1"])
+def test_one_worker_has_one_thread(n_jobs: str, at_once: None, tmp_path: Path) -> None:
+    """Trials at once would draw each other's numbers."""
+    write_settings(tmp_path)
+    with pytest.raises(ValueError, match=rf"--n-jobs is {n_jobs}, expected 1, .*: start several workers with one --storage"):
+        join(tmp_path, "--n-jobs", n_jobs)
 
 
 def test_a_search_begins_with_new_networks(quick: None, tmp_path: Path) -> None:

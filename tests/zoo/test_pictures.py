@@ -3,6 +3,7 @@
 import argparse
 import warnings
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import gymnasium as gym
@@ -20,7 +21,7 @@ from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.adaptation.evaluation import AdaptationRecord
 from sb3_htr.common.vec_env import N_ENVS
 from sb3_htr.zoo.cli import main
-from sb3_htr.zoo.commands import plot
+from sb3_htr.zoo.commands import evaluate, plot
 from sb3_htr.zoo.commands.plot import check_same_settings
 from sb3_htr.zoo.plots import adaptation, curves, style
 from sb3_htr.zoo.plots.style import curve_colours, curve_styles
@@ -152,6 +153,20 @@ def test_plot_draws_all_pictures_of_an_agent(tmp_path: Path, capsys: pytest.Capt
         main(["plot", *NOWHERE, "--n-episodes", "0"])
 
 
+@pytest.mark.parametrize("command", [evaluate, plot])
+def test_an_env_that_is_only_looked_at_is_closed(command: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    looked_at, closed = list[gym.Env](), list[gym.Env]()
+
+    def noting(env: gym.Env) -> np.ndarray | None:
+        looked_at.append(env)
+        monkeypatch.setattr(env, "close", lambda: closed.append(env))
+        return adaptation.start_position(env)
+
+    monkeypatch.setattr(command, "start_position", noting)
+    command.main([*NOWHERE, "--n-episodes", "1", "-o", str(tmp_path)])
+    assert looked_at and closed == looked_at
+
+
 def test_what_is_drawn_is_what_is_evaluated() -> None:
     agent = TrainedAgent(SHIPPED, {"method": "htr-ser", "env_id": ENV_ID, "env_kwargs": {}}, None)
     how = {"tasks": "test", "n_episodes": 2, "explorer": "belief", "stochastic": False, "seed": 3, "device": "cpu"}
@@ -183,6 +198,25 @@ def test_plot_draws_seeds_as_one_curve(
         make_run(folders[0], tiny_pearl(), 3, hyperparams={"explorer": {"name": "belief"}, "gamma": 0.5})
         main(["plot", *arguments])
     check_same_settings("none", [])
+
+
+@pytest.mark.parametrize(("only", "n_adapted"), [(["paths", "latent"], 1), (["paths", "adaptation"], 3)])
+def test_only_those_adapt_that_are_drawn(
+    only: list[str], n_adapted: int, tmp_path: Path, tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in (1, 2):
+        make_run(tmp_path / "seeds", tiny_pearl(seed=number), number)
+    make_run(tmp_path / "other", tiny_pearl(), 1)
+    adapted, adapt = list[Path](), plot.adapt
+
+    def noting(agent: TrainedAgent, args: argparse.Namespace) -> plot.Adapted:
+        adapted.append(agent.path)
+        return adapt(agent, args)
+
+    monkeypatch.setattr(plot, "adapt", noting)
+    folders = [str(tmp_path / name) for name in ("seeds", "other")]
+    assert main(["plot", *folders, "--n-episodes", "1", "--only", *only, "-o", str(tmp_path / "plots")]) == 0
+    assert len(adapted) == n_adapted and "seeds" in str(adapted[0])
 
 
 @pytest.mark.parametrize(

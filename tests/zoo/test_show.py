@@ -14,6 +14,7 @@ from helpers.disks import disk
 from helpers.runs import NOWHERE, SHIPPED, make_run
 from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.zoo.cli import main
+from sb3_htr.zoo.run.agents import TrainedAgent, agent_at
 from sb3_htr.zoo.show.captions import Captioner
 from sb3_htr.zoo.show.film import Film
 from sb3_htr.zoo.show.play import Camera, Moment, Player
@@ -31,6 +32,36 @@ def test_enjoy_shows_an_agent_that_adapts(capsys: pytest.CaptureFixture[str]) ->
     deviations = [float(line.split()[-1]) for line in episodes]
     assert deviations[11] < deviations[6], "z is known better once the task is"
     assert lines[-1].startswith("Solved 2 of 2 tasks")
+
+
+@pytest.mark.parametrize("command", ["enjoy", "record"])
+def test_every_env_that_is_made_to_be_drawn_is_closed(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tiny_pearl: MakePEARL
+) -> None:
+    """Those that are asked for their frames per second alone, too."""
+    made: list[gym.Env] = []
+    closed: list[gym.Env] = []
+    make = gym.make
+
+    class Watched(gym.Wrapper):
+        def close(self) -> None:
+            closed.append(self)
+            super().close()
+
+    def make_watched(*args: Any, **kwargs: Any) -> gym.Env:
+        made.append(Watched(make(*args, **kwargs)))
+        return made[-1]
+
+    make_run(tmp_path / "runs", tiny_pearl())
+    agent = agent_at(tmp_path / "runs")
+    model = agent.load()
+    monkeypatch.setattr(TrainedAgent, "load", lambda *_: model)
+    monkeypatch.setattr(gym, "make", make_watched)
+    monkeypatch.setattr("sb3_htr.zoo.show.window.Window", lambda title, fps: (_ for _ in ()).throw(OSError("no screen")))
+    few = ["--n-tasks", "1", "--n-episodes", "1", "--verbose", "0"]
+    output = ["-o", str(tmp_path / "film.mp4")] if command == "record" else []
+    assert main([command, str(tmp_path / "runs"), *few, *output]) == 0
+    assert made and {*map(id, made)} == {*map(id, closed)}
 
 
 def test_enjoy_needs_no_screen(capsys: pytest.CaptureFixture[str]) -> None:

@@ -64,13 +64,23 @@ def test_evaluate_prints_a_table_and_draws_pictures(
     lines = capsys.readouterr().out.splitlines()
     assert sum(line.strip().startswith(tuple("123456")) for line in lines) == 6
     run = run_folder(runs)
-    record, n = np.load(run / "adaptation.npz"), 20 if "validation" in arguments else 100
+    about = "-last-validation-prior" if arguments else ""
+    record, n = np.load(run / f"adaptation{about}.npz"), 20 if "validation" in arguments else 100
     of = ("last", "validation", "prior") if arguments else ("best", "test", "belief")
     assert (str(record["set"]), str(record["explorer"])) == of[1:] and ("best" in str(record["model"])) == (of[0] == "best")
     assert record["returns"].shape == (n, 6) and record["achieved"].shape == (n, 6, 20, 2)
-    for picture in ("adaptation_curve.png", "adaptation_paths.png"):
+    for picture in (f"adaptation_curve{about}.png", f"adaptation_paths{about}.png"):
         assert (run / picture).read_bytes().startswith(b"\x89PNG")
         assert (run / picture).stat().st_size > 10_000
+
+
+def test_evaluations_of_one_run_do_not_replace_each_other(runs: Path, tmp_path: Path) -> None:
+    of = [[], ["--tasks", "validation"], ["--explorer", "prior"], ["--model", "last"], ["--tasks", "train", "--model", "last"]]
+    for arguments in of:
+        assert main(["evaluate", str(runs), "-o", str(tmp_path), "--n-episodes", "1", *arguments]) == 0
+    names = {path.stem for path in tmp_path.glob("*.npz")}
+    assert names == {f"adaptation{of}" for of in ("", "-validation", "-prior", "-last", "-last-train")}
+    assert len(list(tmp_path.glob("*.png"))) == 2 * len(of)
 
 
 def test_a_model_is_trained_on(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -97,7 +107,7 @@ def test_normalized_runs_are_evaluated_as_they_were_trained(tmp_path: Path) -> N
     assert main(["evaluate", str(run), "--tasks", "validation", "--n-episodes", "2"]) == 0
     # The same model, tasks and seed as in the evaluation during training
     during = np.load(run / "evaluations.npz")["returns"][0]
-    np.testing.assert_allclose(np.load(run / "adaptation.npz")["returns"], during, atol=1e-4)
+    np.testing.assert_allclose(np.load(run / "adaptation-validation.npz")["returns"], during, atol=1e-4)
 
 
 def test_rl_zoo_is_left_as_it_was(runs: Path) -> None:

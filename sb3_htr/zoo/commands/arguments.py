@@ -114,8 +114,8 @@ def chosen_agent(parser: argparse.ArgumentParser, args: argparse.Namespace, path
     :raises ValueError: if arguments contradict each other, or the device cannot be used
     """
     check_device(args.device)
-    for name, limits in {"n_episodes": (1,), "seed": (0, MAX_SEED)}.items():
-        if hasattr(args, name):
+    for name, limits in {"n_episodes": (1,), "n_timesteps": (1,), "fps": (0.1,), "seed": (0, MAX_SEED)}.items():
+        if getattr(args, name, None) is not None:
             check_numbers(**{f"--{name.replace('_', '-')}": (getattr(args, name), *limits)})
     import_packages(args.gym_packages)
     if path is not None:

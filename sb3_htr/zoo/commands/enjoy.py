@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from sb3_htr.zoo.commands.arguments import add_agent_arguments, add_task_arguments, make_parser, parse
 from sb3_htr.zoo.run.agents import TrainedAgent
 from sb3_htr.zoo.show.play import Moment
-from sb3_htr.zoo.show.watch import can_be_drawn, watch
+from sb3_htr.zoo.show.watch import frame_rate, watch
 
 if TYPE_CHECKING:
     from sb3_htr.zoo.show.captions import Captioner
@@ -43,14 +43,14 @@ def main(argv: Sequence[str]) -> None:
 
 def _open_window(agent: TrainedAgent, fps: float | None) -> "tuple[Window, Captioner] | tuple[None, None]":
     """None, and a sentence for the user, where no window can be opened."""
-    if not can_be_drawn(agent):
+    if (own_fps := frame_rate(agent)) is None:
         print(f"Numbers only: {agent.env_id} cannot draw itself, 'rgb_array' is not in its metadata['render_modes'].")
         return None, None
     try:
         from sb3_htr.zoo.show.captions import Captioner
         from sb3_htr.zoo.show.window import Window
 
-        return Window(f"sb3-htr enjoy {agent.env_id}", fps or agent.make_env().metadata.get("render_fps", 30)), Captioner()
+        return Window(f"sb3-htr enjoy {agent.env_id}", fps or own_fps), Captioner()
     except ModuleNotFoundError as error:
         reason = f"{error.name} is not installed (pip install 'sb3_htr[video]')"
     except OSError as error:

@@ -47,8 +47,11 @@ def main(argv: Sequence[str]) -> None:
     tasks = task_set(family, args.tasks)
     explorer = args.explorer or model.explorer.name
     output = args.output or agent.folder or Path(agent.stem)
+    # What is not by default is in the names, or one evaluation of a run would replace another
+    choices = {name: getattr(args, name) for name in ("model", "tasks", "explorer")}
+    which = "".join(f"-{value}" for name, value in choices.items() if value != parser.get_default(name))
     # Around all, as what cannot be written should be known before the work
-    with atomic_path(output / "adaptation.npz") as path:
+    with atomic_path(output / f"adaptation{which}.npz") as path:
         record = record_adaptation(
             model, env, tasks, args.n_episodes, explorer=explorer, deterministic=not args.stochastic, seed=args.seed
         )
@@ -57,14 +60,15 @@ def main(argv: Sequence[str]) -> None:
         about = {"model": str(agent.path), "env_id": agent.env_id, "explorer": explorer, "set": args.tasks, "seed": args.seed}
         about |= {"env_kwargs": json.dumps(agent.env_kwargs, default=str), "deterministic": not args.stochastic}
         np.savez_compressed(path, tasks=tasks, **record._asdict(), **about)
-    pictures = [output / "adaptation_curve.png"]
+    pictures = [output / f"adaptation_curve{which}.png"]
     title = (
         f"{agent.env_id}, {len(tasks)} {args.tasks} tasks, explorer {explorer}{', sampled actions' if args.stochastic else ''}"
     )
     title += "".join(f", {name} {value}" for name, value in agent.other_env_kwargs.items())
     plot_adaptation_curve(record, pictures[0], title)
     if record.achieved.shape[-1] == 2:
-        pictures.append(output / "adaptation_paths.png")
-        start, radius = start_position(agent.make_env()), getattr(family, "goal_radius", None)
-        plot_adaptation_paths(record, tasks, radius, start, pictures[1], title)
+        pictures.append(output / f"adaptation_paths{which}.png")
+        with agent.make_env() as single:
+            start = start_position(single)
+        plot_adaptation_paths(record, tasks, getattr(family, "goal_radius", None), start, pictures[1], title)
     print("Pictures: " + ", ".join(str(picture) for picture in pictures))

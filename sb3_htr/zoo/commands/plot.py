@@ -85,7 +85,7 @@ def adapt(agent: TrainedAgent, args: argparse.Namespace) -> Adapted:
         if isinstance(adaptation, Adaptation):
             particles = adaptation.knowledge.particles()
             found = ~adaptation.exploring()
-            if adaptation.knowledge.tells_success:
+            if adaptation.knowledge.tells_rewards:
                 found &= adaptation.best_return > 0
             found = np.flatnonzero(found[: len(own_tasks)])
             mean, deviation = adaptation.posterior()
@@ -94,11 +94,15 @@ def adapt(agent: TrainedAgent, args: argparse.Namespace) -> Adapted:
 
     how = args.n_episodes, args.explorer, not args.stochastic, args.seed
     record = record_adaptation(model, env, tasks, *how, look)
+    env.close()
     latent = None
     if latents:
         of_tasks, mean, deviation, known_z = zip(*latents, strict=True)
         latent = Latent(np.concatenate(of_tasks), np.concatenate(mean), np.concatenate(deviation), known_z[0])
-    start = start_position(agent.make_env()) if record.achieved.shape[-1] == 2 else None
+    start = None
+    if record.achieved.shape[-1] == 2:
+        with agent.make_env() as single:
+            start = start_position(single)
     explorer = args.explorer or model.explorer.name
     return Adapted(tasks, getattr(family, "goal_radius", None), start, explorer, record, latent)
 
@@ -244,8 +248,11 @@ def main(argv: Sequence[str]) -> None:
         else:
             print("No learning curves: there is no evaluations.npz of a training.")
     if set(args.only) != {"learning"}:
-        adapted = {label: [adapt(agent, args) for agent in agents] for label, agents in groups.items()}
-        plot_adapted(args, env_id, adapted, {label: agents[0].method for label, agents in groups.items()}, new)
+        label, (first, *_) = next(iter(groups.items()))
+        # Paths and latent space are those of the first run alone
+        drawn = groups if "adaptation" in args.only else {label: [first]}
+        adapted = {label: [adapt(agent, args) for agent in agents] for label, agents in drawn.items()}
+        plot_adapted(args, env_id, adapted, {label: agents[0].method for label, agents in drawn.items()}, new)
     print("Pictures: " + (", ".join(str(path) for path in written) or "none"))
 
 

@@ -11,7 +11,7 @@ from sb3_htr.zoo.commands.arguments import add_agent_arguments, add_task_argumen
 from sb3_htr.zoo.show.captions import Captioner
 from sb3_htr.zoo.show.film import MAX_GIF_FPS, SUFFIXES, Film
 from sb3_htr.zoo.show.play import Moment
-from sb3_htr.zoo.show.watch import can_be_drawn, watch
+from sb3_htr.zoo.show.watch import frame_rate, watch
 
 EXAMPLE = """  sb3-htr record --env SparsePointRobot-v0                       SparsePointRobot-v0.mp4
   sb3-htr record runs -o adaptation.gif --task 2 --n-episodes 6
@@ -48,9 +48,9 @@ def main(argv: Sequence[str]) -> None:
         raise ValueError(f"{output} has the suffix {output.suffix!r}, expected one of {', '.join(SUFFIXES)}.")
     if args.every < 1 or not 0 < args.speed < math.inf:
         raise ValueError(f"--every is {args.every} and --speed {args.speed}, expected at least 1 and a number above 0.")
-    if not can_be_drawn(agent):
+    if (own_fps := frame_rate(agent)) is None:
         raise ValueError(f"{agent.env_id} cannot be filmed: 'rgb_array' is not in its metadata['render_modes'].")
-    fps = agent.make_env().metadata.get("render_fps", 30) * args.speed / args.every
+    fps = own_fps * args.speed / args.every
     if output.suffix == ".gif" and fps > MAX_GIF_FPS:
         every = math.ceil(args.every * fps / MAX_GIF_FPS)
         raise ValueError(

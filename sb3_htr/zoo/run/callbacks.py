@@ -6,7 +6,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-import optuna
+from rl_zoo3.callbacks import TrialEvalCallback
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import CSVOutputFormat, TensorBoardOutputFormat
 
@@ -108,26 +108,5 @@ class ProgressCallback(BaseCallback):
         self._end()
 
 
-class MetaTrialEvalCallback(MetaEvalCallback):
-    """
-    :class:`MetaEvalCallback` for a trial of a hyperparameter search; has the attributes of rl_zoo3's ``TrialEvalCallback``.
-
-    :param eval_env: env of the task family
-    :param trial: told of every evaluation, and asked whether to go on
-    :param kwargs: as for :class:`MetaEvalCallback`
-    """
-
-    def __init__(self, eval_env: Any, trial: optuna.Trial, **kwargs: Any) -> None:
-        super().__init__(eval_env, **{"verbose": 0, **kwargs})
-        self.trial = trial
-        self.eval_idx = 0
-        self.is_pruned = False
-
-    def _on_step(self) -> bool:
-        n_evaluations = len(self.returns)
-        continue_training = super()._on_step()
-        if len(self.returns) > n_evaluations:
-            self.eval_idx += 1
-            self.trial.report(self.last_mean_reward, self.eval_idx)
-            self.is_pruned = self.trial.should_prune()
-        return continue_training and not self.is_pruned
+class MetaTrialEvalCallback(TrialEvalCallback, MetaEvalCallback):
+    """rl_zoo3's for a trial of a hyperparameter search, whose evaluations are those of :class:`MetaEvalCallback`."""

@@ -1,5 +1,7 @@
 """The page that goes with a shared agent."""
 
+import json
+import re
 import shlex
 from pathlib import Path
 from typing import Any
@@ -11,9 +13,9 @@ from sb3_htr.adaptation.evaluation import AdaptationRecord
 from sb3_htr.common.markdown import markdown_table
 from sb3_htr.zoo.run.algorithm import Algorithm
 from sb3_htr.zoo.run.hub import model_name
-from sb3_htr.zoo.run.method import DEFAULT, PEARLMethod, get_method, methods
+from sb3_htr.zoo.run.method import DEFAULT, PEARLMethod, get_method, merged, methods
 from sb3_htr.zoo.run.shipped import hyperparams_file
-from sb3_htr.zoo.run.train_arguments import given_arguments
+from sb3_htr.zoo.run.train_arguments import given_arguments, value_of
 from sb3_htr.zoo.run.trust import CONF, PACKAGES, WEIGHTS
 
 TAGS = (
@@ -29,19 +31,23 @@ PEARL = "PEARL (Rakelly et al., 2019)"
 OF_EXPLORERS = """ The explorer says how z is chosen;
 `prior` is the protocol of PEARL's paper."""
 # Arguments of a training that change nothing of its result, or name what is on one machine alone, with the number of their
-# values. What a study brought is among the hyperparameters of the card
+# values. What a study brought is among -params
 LOCAL = {"-f": 1, "--log-folder": 1, "-tb": 1, "--tensorboard-log": 1, "-P": 0, "--progress": 0, "--verbose": 1, "--seed": 1}
 LOCAL |= dict.fromkeys(("--storage", "--study-name", "--trial-id"), 1)
+# In JSON, what Python has no literal for: descriptions of objects, as <class 'torch.nn.modules.activation.Tanh'>, and numbers
+NOT_WRITTEN = re.compile(r'"<|NaN|Infinity')
 
 
 def training_command(record: dict[str, Any]) -> str:
     """
     :param record: of a run
-    :return: the command that trains the same agent on another machine; of files it has the names alone
+    :return: the command that trains the same agent on another machine, empty if there is none; of files it has the names alone
     """
     if "arguments" not in record:
-        return str(record.get("command", "unknown"))
-    arguments = [*given_arguments(record["arguments"]), "--method", record["method"]]
+        return str(record.get("command", ""))
+    arguments = given_arguments(record["arguments"])
+    conf = value_of(arguments, *CONF)
+    has_own_settings = not (conf is None or _is_of_package(conf)) or "--trial-id" in arguments
     words: list[str] = []
     while arguments:
         word = arguments.pop(0)
@@ -49,13 +55,44 @@ def training_command(record: dict[str, Any]) -> str:
             del arguments[: LOCAL[word]]
         elif word in (*CONF, *WEIGHTS):
             # Settings that come with the package are on any machine; of the weights that it began with, there is the name
-            file = Path("".join(arguments[:1]))
+            file = "".join(arguments[:1])
             del arguments[:1]
-            if word in WEIGHTS or (file.parent.name in ("", "hyperparams") and hyperparams_file(file.name).is_file()):
-                words += [word, file.name]
+            if word in WEIGHTS or _is_of_package(file):
+                words += [word, Path(file).name]
+        elif word in ("-params", "--hyperparams") and has_own_settings:  # which have these among them
+            while arguments and not arguments[0].startswith("-"):
+                del arguments[0]
         else:
             words.append(word)
+    words += ["--method", record["method"]]
+    if has_own_settings:
+        params = _params(record, words)
+        if params is None:
+            return ""
+        words += params
     return shlex.join(["sb3-htr", "train", *words, "--seed", str(record["seed"])])
+
+
+def _is_of_package(conf: str) -> bool:
+    """Whether a run was given a file of the package: those of one's own are whole paths in its record."""
+    file = hyperparams_file(Path(conf).name)
+    return file.is_file() and conf in (file.name, str(file.resolve()))
+
+
+def _params(record: dict[str, Any], words: list[str]) -> list[str] | None:
+    """What makes a run's settings of those that the other words have, None if that cannot be written."""
+    method, had = methods().get(record["method"]), record.get("hyperparams", {})
+    if method is None:
+        return None
+    blocks = yaml.safe_load(hyperparams_file(value_of(words, *CONF) or method.algorithm.settings).read_text())
+    of_env = {key: value for key, value in blocks.get(record["env_id"], blocks.get("default", {})).items() if key != "method"}
+    of_words = method.settings(of_env)
+    if value_of(words, "-n", "--n-timesteps") is not None:
+        of_words["n_timesteps"] = had.get("n_timesteps")
+    params = {key: value for key, value in had.items() if key not in of_words or of_words[key] != value}
+    if merged(of_words, params) != had or NOT_WRITTEN.search(json.dumps(params)):
+        return None
+    return ["-params", *(f"{key}:{value!r}" for key, value in params.items())] if params else []
 
 
 def table(scores: dict[str, AdaptationRecord]) -> str:
@@ -154,6 +191,8 @@ def model_card(record: dict[str, Any], scores: dict[str, AdaptationRecord], repo
         watch = f"sb3-htr load_from_hub --env {env_id} -orga {user}{named}\n$ sb3-htr enjoy --env {env_id}{own}"
     use = snippet(algorithm, path, f'gymnasium.make("{env_id}"{kwargs})', min(n_episodes, 10))
     of_explorers = OF_EXPLORERS if algorithm.also_explores_by else ""
+    command = record.get("command")
+    training = f"```console\n$ {command}\n```\n\n" if command else ""
     versions = ", ".join(f"{package} {version}" for package, version in record.get("versions", {}).items())
     return f"""---
 {data.to_yaml()}
@@ -186,11 +225,7 @@ A model file can run code when it is loaded like this. The commands of `sb3-htr`
 
 ## Training
 
-```console
-$ {record.get("command", "unknown")}
-```
-
-The model after {record["num_timesteps"]:,} env steps ({record["model"]}). {versions}.
+{training}The model after {record["num_timesteps"]:,} env steps ({record["model"]}). {versions}.
 
 ```yaml
 {yaml.safe_dump(record.get("hyperparams", {}), sort_keys=True).strip()}

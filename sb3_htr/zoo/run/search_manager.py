@@ -1,7 +1,9 @@
 """A search for hyperparameters by rl_zoo3 and Optuna."""
 
+import json
 import traceback
 from pathlib import Path
+from typing import Any
 
 import optuna
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
@@ -24,15 +26,22 @@ class SearchManager(MetaExperimentManager):
             )
         if self.continue_training:
             raise ValueError("The trials of a search begin with new networks: leave -i out.")
-        if self.storage is not None:
-            facts = {
-                "env": self.env_name.gym_id,
-                "method": self.method.name,
-                "env-kwargs": self.env_kwargs,
-                "n-timesteps": self.n_timesteps,
-                "hyperparams": self._given,
-            }
-            check_is_of(self.storage, self.study_name, facts, note=True)
+        if self.n_jobs != 1:
+            raise ValueError(
+                f"--n-jobs is {self.n_jobs}, expected 1, as threads would draw from the same seeded generators: start several "
+                "workers with one --storage."
+            )
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """
+        As in a training. They are what a study is of.
+
+        :return: hyperparameters, and the same sorted to be saved
+        """
+        hyperparams, saved = super().read_hyperparameters()
+        of_study = {"env_kwargs": self.env_kwargs, **saved, "not searched": sorted(names_of(self._given))}
+        self._of_study = json.loads(json.dumps(of_study, default=str))
+        return hyperparams, saved
 
     def create_log_folder(self) -> None:
         """Trials have none."""
@@ -53,11 +62,6 @@ class SearchManager(MetaExperimentManager):
         :raises optuna.TrialPruned: for hyperparameters that promise little or diverge
         """
         try:
-            space = self.method.algorithm.search_space
-            assert space is not None
-            sampled = space.sample(trial, names_of(self._given) | self.method.not_searched())
-            # To rl_zoo3, dicts of the file are gone where the sampler has one
-            HYPERPARAMS_SAMPLER[self.algo] = lambda *_: merged(self._hyperparams, self._preprocess_schedules(sampled))
             return super().objective(trial)
         except DivergedError as error:
             print(f"Trial {trial.number} is pruned: {error}")
@@ -66,12 +70,23 @@ class SearchManager(MetaExperimentManager):
     def hyperparameters_optimization(self) -> None:
         """Search. Where the report goes is looked at first."""
         Path(self.log_folder, self.algo).mkdir(parents=True, exist_ok=True)
+        if self.storage is not None:  # not before: what is refused by itself leaves the study to others
+            facts = {"env": self.env_name.gym_id, "method": self.method.name, "settings": self._of_study}
+            check_is_of(self.storage, self.study_name, facts, note=True)
+        HYPERPARAMS_SAMPLER[self.algo] = lambda trial, *_: self._sampled(trial)
         try:
             super().hyperparameters_optimization()
         except ValueError as error:
             if all(frame.name != "best_trial" for frame in traceback.extract_tb(error.__traceback__)):
                 raise
             print("none: no trial was finished. The same command goes on.")
+
+    def _sampled(self, trial: optuna.Trial) -> dict[str, Any]:
+        space = self.method.algorithm.search_space
+        assert space is not None
+        sampled = space.sample(trial, names_of(self._given) | self.method.not_searched())
+        # To rl_zoo3, dicts of the file are gone where the sampler has one
+        return merged(self._hyperparams, self._preprocess_schedules(sampled))
 
     def _create_sampler(self, sampler_method: str) -> optuna.samplers.BaseSampler:
         sampler = super()._create_sampler(sampler_method)

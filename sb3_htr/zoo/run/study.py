@@ -69,11 +69,11 @@ def check_is_there(storage: str) -> None:
 
 def check_is_of(storage: str, name: str | None, facts: dict[str, Any], note: bool = False) -> None:
     """
-    Trials of several envs, methods or budgets have no best one, and settings of one are none of another.
+    Trials of several envs, methods or settings have no best one, and settings of one are none of another.
 
     :param storage: as given
     :param name: of a study, which need not be there
-    :param facts: what a training, or a search, is of
+    :param facts: what a training, or a search, is of: texts, and ``settings`` as JSON has them
     :param note: whether to write them into the study
     :raises ValueError: if the study is of others; older ones do not say
     """
@@ -82,13 +82,22 @@ def check_is_of(storage: str, name: str | None, facts: dict[str, Any], note: boo
     except KeyError:  # it is said elsewhere that there is none
         return
     for fact, value in facts.items():
-        if (known := study.user_attrs.get(fact, str(value))) != str(value):
+        if (known := study.user_attrs.get(fact, value)) != value:
+            options = f"--{fact}"
+            if fact == "settings":
+                options = "-conf, -params, -n and --env-kwargs"
+                known, value = _without(known, value), _without(value, known)
             raise ValueError(
-                f"The study {study.study_name!r} is of {fact} {known}, and not {value}: give --{fact} as there, or search "
+                f"The study {study.study_name!r} is of {fact} {known}, and not {value}: give {options} as there, or search "
                 "under another --study-name."
             )
         if note:
-            study.set_user_attr(fact, str(value))
+            study.set_user_attr(fact, value)
+
+
+def _without(settings: dict[str, Any], others: dict[str, Any]) -> dict[str, Any]:
+    """Those that the others do not have, or have otherwise."""
+    return {name: value for name, value in settings.items() if (name, value) not in others.items()}
 
 
 def without_password(storage: str) -> str:

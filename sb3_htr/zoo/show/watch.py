@@ -1,6 +1,7 @@
 """Plays tasks for a command that shows them, and prints what happens."""
 
 import argparse
+import contextlib
 from collections.abc import Callable
 
 from sb3_htr.adaptation.evaluation import task_set
@@ -56,9 +57,11 @@ def watch(agent: TrainedAgent, args: argparse.Namespace, every: int, show: Show)
     return ends
 
 
-def can_be_drawn(agent: TrainedAgent) -> bool:
+def frame_rate(agent: TrainedAgent) -> float | None:
     """
     :param agent: whose env is meant
-    :return: whether the env makes pictures
+    :return: frames per second of the env, None if it makes no pictures
     """
-    return "rgb_array" in agent.make_env().metadata.get("render_modes", ())
+    with contextlib.closing(agent.make_env()) as env:
+        metadata = env.metadata
+    return float(metadata.get("render_fps") or 30) if "rgb_array" in metadata.get("render_modes", ()) else None
