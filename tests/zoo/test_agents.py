@@ -72,6 +72,13 @@ def test_a_run_without_a_model_is_left_out(run: Path, tmp_path: Path, capsys: py
     assert f"{unfinished} has no model yet, and is left out." in capsys.readouterr().err
 
 
+def test_the_newest_run_is_the_one_that_was_begun_last(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    """Also of a copy, whose files were written in another order."""
+    for number, started in ((2, "2026-03-01T10:00:00+00:00"), (1, "2026-01-01T10:00:00+00:00")):
+        make_run(tmp_path / "copy", tiny_pearl(), number, started=started)
+    assert agent_at(tmp_path / "copy").folder == run_folder(tmp_path / "copy", number=2)
+
+
 def test_a_folder_of_seeds_is_one_curve_whatever_else_is_in_it(
     run: Path, tiny_pearl: MakePEARL, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

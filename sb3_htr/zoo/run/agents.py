@@ -182,10 +182,17 @@ def find_runs(folder: Path) -> list[Path]:
     :return: run folders, the oldest first
     :raises FileNotFoundError: if there is none
     """
-    runs = sorted(folder.rglob(RECORD), key=lambda path: path.stat().st_mtime)
+    runs = sorted(folder.rglob(RECORD), key=_begun)
     if not runs:
         raise FileNotFoundError(f"There is no run in {folder}: give the folder that `sb3-htr train` printed as 'Log path'.")
     return [run.parent for run in runs]
+
+
+def _begun(record: Path) -> tuple[str, float]:
+    """When a run was begun, as its record says: files of a copy have other times. Those that do not say come first."""
+    with contextlib.suppress(ValueError):  # what is wrong with it is said where it is needed
+        return str(read_record(record).get("started", "")), record.stat().st_mtime
+    return "", record.stat().st_mtime
 
 
 def runs_with_models(folder: Path) -> list[Path]:
