@@ -50,7 +50,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("command", "says"),
     [
-        (["train", "--env", "SparseWheeled-v0", "-n", "480", "--eval-freq", "-1", "-params", *SMALL], "Log path"),
+        (["train", "--env", "SparseWheeled-v0", "-n", "480", "--eval-episodes", "2", "-params", *SMALL], "Log path"),
         (["enjoy", "--env", "SparsePointRobot-v0", "--n-episodes", "2", "--n-tasks", "1"], "htr-ser/SparsePointRobot-v0"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",

@@ -75,7 +75,7 @@ def headline(summaries: dict[str, dict[str, Any]], methods_of: dict[str, tuple[s
     for name, methods in methods_of.items():
         scores: dict[tuple[str, ...], dict[tuple[str, str], str]] = {}
         for row in summaries.get(name, {"rows": []})["rows"]:
-            if row["variant"] in methods and not row.get("tested_on") and (row["explorer"], row["metric"]) in shown:
+            if row["variant"] in methods and not row["tested_on"] and (row["explorer"], row["metric"]) in shown:
                 key = (row["env"], f"{row['env_steps']:,}", str(row["n_seeds"]), row["variant"], row["method"])
                 scores.setdefault(key, {})[row["explorer"], row["metric"]] = _interval(row)
         for (env, n_steps, n_runs, variant, method), cells in scores.items():

@@ -60,8 +60,8 @@ class AdaptedAgent:
         :raises ValueError: for an actor of one's own
         """
         arrays = {name: th.from_numpy(np.array(getattr(self, name))) for name in ("z", "returns", "successes")}
-        with atomic_path(with_suffix(path, ".pt")) as temporary:
-            th.save({"format": FORMAT, "policy": acting_state(self.policy), **arrays}, temporary)
+        with atomic_path(with_suffix(path, ".pt")) as temporary, open(temporary, "wb") as file:
+            th.save({"format": FORMAT, "policy": acting_state(self.policy), **arrays}, file)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], device: th.device | str = "cpu") -> "AdaptedAgent":

@@ -12,8 +12,9 @@ from uuid import uuid4
 
 from sb3_htr.common.errors import last_line
 
-# What torch and zip files, of a full disk and of a clock that zip files do not know, make no OSError of
-OF_WRITING = re.compile(r"PytorchStreamWriter|inline_container|\bZIP\b")
+# What torch says of a disk that is full, and zip files of a clock that they do not know, in errors that are no OSError
+OF_A_DISK = re.compile(r"PytorchStreamWriter|inline_container|iostream error")
+OF_A_CLOCK = re.compile(r"\bZIP\b")
 
 
 @contextmanager
@@ -49,7 +50,9 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
             finally:
                 os.close(parent)
     except (RuntimeError, ValueError, struct.error) as error:
-        if isinstance(error, struct.error) or OF_WRITING.search(str(error)):
+        if OF_A_DISK.search(str(error)):
+            raise OSError("torch could not write it, as on a full disk") from error
+        if isinstance(error, struct.error) or OF_A_CLOCK.search(str(error)):
             raise OSError(last_line(error)) from error
         raise
     finally:

@@ -30,7 +30,8 @@ def write_checkpoint(folder: str | os.PathLike[str], state: dict[str, Any]) -> N
     """
     with atomic_path(folder) as temporary:
         temporary.mkdir()
-        th.save(state, temporary / STATE)
+        with open(temporary / STATE, "wb") as file:  # whose errors are those of the system, unlike torch's own
+            th.save(state, file)
         manifest = {
             "format": FORMAT,
             "versions": versions(),

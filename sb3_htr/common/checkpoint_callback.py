@@ -42,9 +42,9 @@ class HasState(Protocol):
 def numbers_of(callback: BaseCallback) -> dict[str, Any]:
     """
     :param callback: that has no state of its own to tell, as SB3's have none
-    :return: its numbers, counts among them, but for those that it is made with
+    :return: its numbers, counts among them
     """
-    plain = {name: _plain(value) for name, value in vars(callback).items() if name not in keywords_of(type(callback))}
+    plain = {name: _plain(value) for name, value in vars(callback).items()}
     return {name: value for name, value in plain.items() if type(value) in NUMBERS}
 
 
@@ -53,8 +53,8 @@ def restore_numbers(callback: BaseCallback, numbers: dict[str, Any]) -> None:
     :param callback: which has these numbers
     :param numbers: of :func:`numbers_of`; what else a file may name stays as it is
     """
-    # A default may be an attribute of the class; older files have what the callback was made with
-    known = {name for name in numbers if type(_plain(getattr(callback, name, None))) in NUMBERS} - keywords_of(type(callback))
+    # A default may be an attribute of the class
+    known = {name for name in numbers if type(_plain(getattr(callback, name, None))) in NUMBERS}
     vars(callback).update({name: value for name, value in numbers.items() if name in known and type(value) in NUMBERS})
 
 
@@ -96,7 +96,7 @@ class CheckpointCallback(BaseCallback):
     :param save_path: folder of the run
     :param keep: number of checkpoints to keep, the latest ones
     :param companions: callbacks of the same training. Saved too, of them and of those that they call, is the state, or, of one
-        that has no ``state_dict``, each attribute that is a number
+        that has no ``state_dict``, each attribute that is a number, but for arguments of its constructor that did not change
     :param name_prefix: for SB3's signature, not used
     :param verbose: 1 says where checkpoints are written
     :raises ValueError: if none would be kept; at the beginning of a training, if another callback calls it, as
@@ -121,6 +121,8 @@ class CheckpointCallback(BaseCallback):
         self._last_calls = 0
         self._written: Path | None = None
         self._pending: dict[str, Any] | None = None
+        # Of each callback, before anything was restored or counted
+        self._made_with: list[dict[str, Any]] = []
         self.stopping = self._stopped = self._has_trained = False
 
     def restore(self, model: HasState, state: dict[str, Any]) -> None:
@@ -138,6 +140,7 @@ class CheckpointCallback(BaseCallback):
                 f"within others counted, and goes on with {len(callbacks) - 1}: give it the same ones, in the same order."
             )
         model.load_state_dict(state["model"])
+        self._made_with = [numbers_of(callback) for callback in callbacks]
         for callback, remembered in zip(callbacks, state["callbacks"], strict=True):
             callback.n_calls = remembered["n_calls"]
             if isinstance(callback, HasState):
@@ -168,6 +171,7 @@ class CheckpointCallback(BaseCallback):
         if self._has_trained:  # what stopped a training before this one
             self.stopping = self._stopped = False
         self._has_trained = True
+        self._made_with = self._made_with or [numbers_of(callback) for callback in self._callbacks()]
         if self._pending is not None:
             at = self._pending["model"]["counters"]["num_timesteps"]
             if self.num_timesteps != at:
@@ -269,8 +273,10 @@ class CheckpointCallback(BaseCallback):
 
     def _callback_states(self) -> list[dict[str, Any]]:
         states = []
-        for callback in self._callbacks():
-            state = None if callback is self else numbers_of(callback)
+        for callback, made_with in zip(self._callbacks(), self._made_with, strict=True):
+            settings = keywords_of(type(callback)) & made_with.keys()
+            numbers = {k: v for k, v in numbers_of(callback).items() if k not in settings or v != made_with[k]}
+            state = None if callback is self else numbers
             if isinstance(callback, HasState):
                 state = callback.state_dict()
             file = io.BytesIO()

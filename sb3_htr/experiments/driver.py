@@ -117,7 +117,11 @@ class Driver:
         self.runs.look([cell])
         if isinstance(error, Exception):
             # Ray's text is a traceback, with the error at its end
-            self._fail(cell, f"{type(error).__name__}: {error}".strip().splitlines()[-1], isinstance(error, HOPELESS))
+            self._fail(
+                cell,
+                f"{type(error).__name__}: {error}".strip().splitlines()[-1],
+                isinstance(error, HOPELESS) and cell.device == "cpu",
+            )
         elif error is not None:  # of this process alone: it, or a callback of its training, was told to stop
             print(f"{cell.label} was interrupted, and is left where it is.", file=sys.stderr, flush=True)
             self.failed[cell.label] = "it was interrupted"

@@ -19,8 +19,8 @@ T = TypeVar("T")
 GPU_SHARE = 0.2
 # Seconds: a node on which calls fail sooner, as where a disk is full, is kept busy so long, or it would take the whole queue
 FAST = 60.0
-# Failures of the cell, which come again wherever it is tried. A ValueError, as of a wrong setting, may be of the node alone: a
-# GPU that is busy, a file that is torn there, another version of a package
+# Failures of the cell, which come again, bit for bit, on a CPU of the kind. A ValueError, as of a wrong setting, may be of the
+# node alone: a GPU that is busy, a file that is torn there, another version of a package
 HOPELESS = (DivergedError,)
 
 

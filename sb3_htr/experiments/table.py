@@ -17,7 +17,7 @@ def columns(summary: dict[str, Any]) -> dict[str, str]:
     :param summary: content of a ``summary.json``
     :return: metrics and heads of the columns of scores
     """
-    n_episodes = summary["rows"][0].get("n_episodes", 20)
+    n_episodes = summary["rows"][0]["n_episodes"]
     # A family that tells no successes has none
     has_successes = any(row["metric"] == "success_rate" and row["high"] > 0 for row in summary["rows"])
     shown = COLUMNS if has_successes else ("last_episode_return",)
@@ -50,13 +50,13 @@ def table(summary: dict[str, Any]) -> str:
     ]
     env_steps = " / ".join(f"{n:,}" for n in sorted({row["env_steps"] for row in rows}))
     about = f"{rows[0]['env']}, {env_steps} env steps, {_runs(rows)}."
-    later = summary.get("evaluation_commit", summary["commit"])
+    later = summary["evaluation_commit"]
     # Interquartile means of three runs trim none
     middle = "IQM over runs (of three or fewer, their mean)" if min(row["n_seeds"] for row in rows) <= 3 else "IQM over runs"
     commits = summary["commit"] if later == summary["commit"] else f"{summary['commit']}, evaluated by {later}"
     return (
         f"{markdown_table(head, body)}\n\n{about} Final models on the test tasks: {middle}, "
-        f"95 % bootstrap interval over runs, tasks and {summary.get('n_eval_seeds', 1)} evaluation seeds. "
+        f"95 % bootstrap interval over runs, tasks and {summary['n_eval_seeds']} evaluation seeds. "
         f"`{summary['command']}`, commit {commits}, {summary['machine']}.\n"
     )
 
@@ -89,7 +89,7 @@ def place(row: dict[str, Any]) -> str:
     :param row: of a ``summary.json``
     :return: what env a model was tested on, other than in training; empty if it was that
     """
-    return ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in row.get("tested_on", {}).items())
+    return ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in row["tested_on"].items())
 
 
 def numbers(row: dict[str, Any], digits: int) -> str:

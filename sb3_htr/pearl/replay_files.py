@@ -34,8 +34,8 @@ class ReplayFiles(Resumable, OffPolicyAlgorithm):
         state = self._replay_state()
         if isinstance(path, io.IOBase):
             return th.save(state, cast(IO[bytes], path))
-        with atomic_path(with_suffix(path, ".pt")) as temporary:
-            th.save(state, temporary)
+        with atomic_path(with_suffix(path, ".pt")) as temporary, open(temporary, "wb") as file:
+            th.save(state, file)
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """

@@ -116,12 +116,26 @@ def test_counts_of_callbacks_of_others_go_on(tiny_pearl: MakePEARL, tmp_path: Pa
     assert stop.n_episodes == 3 and stop.max_episodes == 11 and "_on_step" not in vars(stop) and stop.model is model
 
 
-def test_what_a_callback_is_made_with_is_not_what_it_was_made_with_once() -> None:
-    """Only what it has counted goes on."""
-    before, now = StopTrainingOnMaxEpisodes(100, verbose=1), StopTrainingOnMaxEpisodes(500)
-    before.n_episodes = 7
-    restore_numbers(now, numbers_of(before))
-    assert (now.n_episodes, now.max_episodes, now.verbose) == (7, 500, 0)
+class Anneals(BaseCallback):
+    """What it is made with is where it begins."""
+
+    def __init__(self, beta: float, rate: float) -> None:
+        super().__init__()
+        self.beta, self.rate = beta, rate
+
+    def _on_step(self) -> bool:
+        self.beta *= self.rate
+        return True
+
+
+def test_what_a_callback_is_made_with_is_not_what_it_was_made_with_once(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    """Only what it has counted and changed goes on."""
+    before: list[BaseCallback] = [StopTrainingOnMaxEpisodes(100, verbose=1), Anneals(1.0, 0.99)]
+    tiny_pearl().learn(ROLLOUT, [*before, CheckpointCallback(1, str(tmp_path), companions=before)])
+    stop, anneals = StopTrainingOnMaxEpisodes(500), Anneals(1.0, 0.5)
+    CheckpointCallback(1, str(tmp_path), companions=[stop, anneals]).restore(tiny_pearl(), load_latest(tmp_path)[1])
+    assert (stop.n_episodes, stop.max_episodes, stop.verbose) == (before[0].n_episodes, 500, 0)  # type: ignore[attr-defined]
+    assert anneals.beta == before[1].beta < 1.0 and anneals.rate == 0.5  # type: ignore[attr-defined]
 
 
 class Highest(BaseCallback):

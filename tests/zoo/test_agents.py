@@ -77,6 +77,12 @@ def test_the_newest_run_is_the_one_that_was_begun_last(tiny_pearl: MakePEARL, tm
     for number, started in ((2, "2026-03-01T10:00:00+00:00"), (1, "2026-01-01T10:00:00+00:00")):
         make_run(tmp_path / "copy", tiny_pearl(), number, started=started)
     assert agent_at(tmp_path / "copy").folder == run_folder(tmp_path / "copy", number=2)
+    # One that does not say when, as an agent of the Hub, is as new as its file; and a damaged one is not passed over
+    pulled = make_run(tmp_path / "copy", tiny_pearl(), 3)
+    assert agent_at(tmp_path / "copy").folder == pulled
+    (pulled / RECORD).write_text("{")
+    with pytest.raises(ValueError, match="is damaged, or no record of a run"):
+        agent_at(tmp_path / "copy")
 
 
 def test_a_folder_of_seeds_is_one_curve_whatever_else_is_in_it(

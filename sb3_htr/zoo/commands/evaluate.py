@@ -48,8 +48,8 @@ def main(argv: Sequence[str]) -> None:
     explorer = args.explorer or model.explorer.name
     output = args.output or agent.folder or Path(agent.stem)
     # What is not by default is in the names, or one evaluation of a run would replace another
-    choices = {name: getattr(args, name) for name in ("model", "tasks", "explorer")}
-    which = "".join(f"-{value}" for name, value in choices.items() if value != parser.get_default(name))
+    choices = {args.model: parser.get_default("model"), args.tasks: parser.get_default("tasks"), explorer: model.explorer.name}
+    which = "".join(f"-{choice}" for choice, default in choices.items() if choice != default)
     # Around all, as what cannot be written should be known before the work
     with atomic_path(output / f"adaptation{which}.npz") as path:
         record = record_adaptation(
@@ -60,6 +60,7 @@ def main(argv: Sequence[str]) -> None:
         about = {"model": str(agent.path), "env_id": agent.env_id, "explorer": explorer, "set": args.tasks, "seed": args.seed}
         about |= {"env_kwargs": json.dumps(agent.env_kwargs, default=str), "deterministic": not args.stochastic}
         np.savez_compressed(path, tasks=tasks, **record._asdict(), **about)
+    env.close()
     pictures = [output / f"adaptation_curve{which}.png"]
     title = (
         f"{agent.env_id}, {len(tasks)} {args.tasks} tasks, explorer {explorer}{', sampled actions' if args.stochastic else ''}"

@@ -8,6 +8,7 @@ import sys
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, cast
 
@@ -188,11 +189,12 @@ def find_runs(folder: Path) -> list[Path]:
     return [run.parent for run in runs]
 
 
-def _begun(record: Path) -> tuple[str, float]:
-    """When a run was begun, as its record says: files of a copy have other times. Those that do not say come first."""
+def _begun(record: Path) -> str:
+    """When a run was begun, as its record says, since files of a copy have other times; of one that does not say, its own."""
+    written = datetime.fromtimestamp(record.stat().st_mtime, timezone.utc).isoformat()
     with contextlib.suppress(ValueError):  # what is wrong with it is said where it is needed
-        return str(read_record(record).get("started", "")), record.stat().st_mtime
-    return "", record.stat().st_mtime
+        return str(read_record(record).get("started", written))
+    return written
 
 
 def runs_with_models(folder: Path) -> list[Path]:
