@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
@@ -326,7 +326,17 @@ def test_one_that_was_taken_for_dead_sends_nothing(url: str, trains: Any) -> Non
     assert not store.is_finished(cell) and store.is_claimed(cell)
 
 
-def test_one_that_lost_its_cell_stops_at_once(url: str, trains: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(params=[signal.SIGINT, signal.SIGTERM])
+def heard(request: pytest.FixtureRequest) -> Iterator[None]:
+    """One signal that interrupts this process, and one that it ignores, as a script's background commands do SIGINT."""
+    before = {kind: signal.signal(kind, signal.SIG_IGN) for kind in (signal.SIGINT, signal.SIGTERM)}
+    signal.signal(request.param, signal.default_int_handler)
+    yield
+    for kind, handler in before.items():
+        signal.signal(kind, handler)
+
+
+def test_one_that_lost_its_cell_stops_at_once(heard: None, url: str, trains: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(objects, "RENEW", 0.05)
     (cell, *_), store = CELLS, ObjectStore(url)
 
@@ -334,12 +344,12 @@ def test_one_that_lost_its_cell_stops_at_once(url: str, trains: Any, monkeypatch
         (path,) = store.files.find(f"{store.root}/{cell.experiment}/{cell.name}/.claims")
         while not Claim(store.files, path.rpartition("/")[0]).take(void=store.files.cat_file(path)):
             pass
-        for _ in range(1000):
+        for _ in range(300):
             time.sleep(0.1)
 
     trains(work)
     start = time.monotonic()
-    assert not objects.run_on_copy(cell, url) and time.monotonic() - start < 50
+    assert not objects.run_on_copy(cell, url) and time.monotonic() - start < 25
 
 
 def test_what_killed_processes_left_is_removed_and_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

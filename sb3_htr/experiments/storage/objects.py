@@ -1,5 +1,6 @@
 """Runs in an object store, by fsspec: a node works on a copy of a cell's folder, and sends what it becomes."""
 
+import signal
 import sys
 import time
 from _thread import interrupt_main
@@ -192,7 +193,8 @@ def run_on_copy(cell: Cell, url: str, void: bytes | None = None) -> bool:
             print(f"{cell.label} was taken over by another process: this one stops.", file=sys.stderr, flush=True)
             lost.set()
             if in_main_thread:
-                interrupt_main()
+                # A script's background commands ignore SIGINT, and the command takes SIGTERM for it
+                interrupt_main(signal.SIGTERM if signal.getsignal(signal.SIGINT) is signal.SIG_IGN else signal.SIGINT)
 
     try:
         if not _patiently(lambda: claim.take(void)):
