@@ -226,7 +226,7 @@ class OffPolicyMetaAlgorithm(MetaTest, ReplayFiles, CheckedFiles, SAC):
             seed=self.seed,
             task_family=family,
             max_episode_steps=checks.get_max_episode_steps(env),
-            **{"context_episodes": self.n_episodes_per_task, **self.replay_buffer_kwargs},
+            **self.replay_buffer_kwargs,
         )
         task_bank = TaskBank(family, replay_buffer.transitions, self.context_size, self.seed)
         replay_buffer.episode_listeners.append(task_bank.on_episode)

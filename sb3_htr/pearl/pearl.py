@@ -60,8 +60,7 @@ class PEARL(OffPolicyMetaAlgorithm):
     :param gradient_steps: updates after each rollout; by default one for 20 env steps of a rollout whose episodes last to the
         time limit, and so more where they end early (PEARL's reference: 1000)
     :param replay_buffer_class: a MultiTaskReplayBuffer
-    :param replay_buffer_kwargs: its arguments, among them ``relabel_probability`` (K of HTR; at 0 nothing is relabelled) and
-        ``context_episodes``, by default ``n_episodes_per_task``
+    :param replay_buffer_kwargs: its arguments, among them ``relabel_probability`` (K of HTR; at 0 nothing is relabelled)
     :param ent_coef: entropy coefficient, ``"auto"`` learns it (0.01 is the reward scale 100 of PEARL's reference)
     :param target_update_interval: updates between soft updates of the target critics
     :param target_entropy: for ``ent_coef="auto"``

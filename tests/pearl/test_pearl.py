@@ -432,10 +432,3 @@ def test_parts_that_draw_do_so_apart_from_each_other(tiny_pearl: MakePEARL) -> N
     model.env.reset()
     generators = [model._rng, model.task_bank._rng, buffer._rng, buffer.relabel_rng, model.env.get_attr("np_random")[0]]
     assert len({generator.integers(2**60) for generator in generators}) == len(generators)
-
-
-def test_contexts_are_of_the_latest_collection(tiny_pearl: MakePEARL) -> None:
-    """Unless another number is given."""
-    for given, expected in (({}, 3), ({"replay_buffer_kwargs": {"context_episodes": 5}}, 5)):
-        buffer = tiny_pearl(n_episodes_per_task=3, **given).replay_buffer
-        assert buffer is not None and buffer.context_episodes == expected
