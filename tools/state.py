@@ -23,8 +23,6 @@ DOCUMENTS = (RESULTS.parent / "docs" / "results" / "state.md",)
 HEADS = ("results", "runs", "trained by", "changed since, in training", "changed since, in evaluation")
 # What raw data say of a run; older ones say less
 SAID = ("commit", "evaluation_commit", "cell", "hyperparams", "rl_zero_reward_fraction")
-# Where it was not kept, this was the default
-CONTEXT_EPISODES = 10
 
 
 class Run(NamedTuple):
@@ -78,14 +76,12 @@ def _name(explorer: Any) -> str:
 def _facts(cell: dict[str, Any], used: dict[str, Any], env: dict[str, Any], rewarded: bool) -> dict[str, Any]:
     steps = cell["env_kwargs"].get("max_episode_steps", env["steps"])
     settings = {**settings_for(steps, n_tasks_per_rollout=1), **used}
-    asked, had = (some.get("replay_buffer_kwargs", {}).get("context_episodes") for some in (cell["settings"], used))
-    older = asked is None and (had or CONTEXT_EPISODES) != settings["n_episodes_per_task"]
     return {
         "method": cell["method"],
         "env": cell["env_id"],
         "steps": steps,
         "contexts": steps / settings["context_size"],
-        "is": {*env.get("is", ()), *["rewarded"] * rewarded, *["of older contexts"] * older},
+        "is": {*env.get("is", ()), *["rewarded"] * rewarded},
     }
 
 
