@@ -43,10 +43,29 @@ def drive(observations: np.ndarray, tasks: np.ndarray) -> np.ndarray:
     return np.clip(np.stack((forwards - turning, forwards + turning), axis=1), -1, 1)
 
 
+def thrust(observations: np.ndarray, tasks: np.ndarray) -> np.ndarray:
+    """
+    :param observations: (n, 2) velocities of sledges
+    :param tasks: (n, 1) target speeds, which it does not look at
+    :return: (n, 2) actions: full thrust along one axis, which passes every speed
+    """
+    return np.tile(np.float32([1, 0]), (len(observations), 1))
+
+
+def hold(observations: np.ndarray, tasks: np.ndarray) -> np.ndarray:
+    """
+    :param observations: (n, 2) velocities of sledges
+    :param tasks: (n, 1) target speeds
+    :return: (n, 2) actions: to the speed along both axes, as fast as it goes, and no further
+    """
+    return np.clip((tasks / np.sqrt(2) - 0.95 * observations) / 0.2, -1, 1)
+
+
 SCRIPTS: dict[str, dict[str, Script | None]] = {
     "SparsePointRobot-v0": {"random actions": None, "straight": straight},
     "SparseWheeled-v0": {"random actions": None, "drive": drive},
     "SparseAnt-v0": {"random actions": None},
+    "SparseTargetSpeed-v0": {"random actions": None, "thrust": thrust, "hold": hold},
 }
 
 

@@ -34,9 +34,9 @@ def test_floors_are_below_ceilings(monkeypatch: pytest.MonkeyPatch, capsys: pyte
         monkeypatch.setattr(example, name, value)
     example.main("validation")
     rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
-    assert [row[-1] for row in rows] == ["0.0000 |", "1.0000 |"] * 2
-    floor, straight, still, drive = (float(row[2].split()[0]) for row in rows)
-    assert floor < 0.1 and straight > 13 and still < 0 and drive > 125
+    assert [row[-1] for row in rows] == [*["0.0000 |", "1.0000 |"] * 2, "0.0000 |", *["1.0000 |"] * 2]
+    floor, straight, still, drive, noise, thrust, hold = (float(row[2].split()[0]) for row in rows)
+    assert floor < 0.1 and straight > 13 and still < 0 and drive > 125 and noise < 0 and thrust < 3 and hold > 30
 
 
 DENSE = {
