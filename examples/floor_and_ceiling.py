@@ -49,7 +49,7 @@ def thrust(observations: np.ndarray, tasks: np.ndarray) -> np.ndarray:
     :param tasks: (n, 1) target speeds, which it does not look at
     :return: (n, 2) actions: full thrust along one axis, which passes every speed
     """
-    return np.tile(np.float32([1, 0]), (len(observations), 1))
+    return np.tile([1.0, 0.0], (len(observations), 1))
 
 
 def hold(observations: np.ndarray, tasks: np.ndarray) -> np.ndarray:

@@ -2,8 +2,6 @@
 
 import os
 import time
-import warnings
-from collections.abc import Callable
 from typing import Any, cast
 
 import numpy as np
@@ -15,7 +13,7 @@ from sb3_htr.adaptation.evaluation import MetaLearner, check_adapts, first_succe
 from sb3_htr.adaptation.explorers import to_explorer
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checks import check_is_env, get_task_family
-from sb3_htr.common.errors import reason
+from sb3_htr.common.errors import training_goes_on
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
 
@@ -116,9 +114,9 @@ class MetaEvalCallback(EvalCallback):
         # Of a training that is shorter than the time between two evaluations, and was not interrupted
         if self.eval_freq > 0 and not self.returns and self.num_timesteps >= self.model._total_timesteps:
             self._evaluate()
-        elif self.returns and self.log_path is not None:
+        elif self.returns:
             # No later one makes up for a file that could not be written
-            self._write(f"{self.log_path}.npz", self._save_results)
+            self._save_results()
 
     def _evaluate(self) -> bool:
         """Whether training goes on."""
@@ -133,15 +131,16 @@ class MetaEvalCallback(EvalCallback):
         self.evaluations_timesteps.append(self.num_timesteps)
         self.returns.append(record.returns)
         self.successes.append(record.successes)
-        if self.log_path is not None:
-            self._write(f"{self.log_path}.npz", self._save_results)
+        self._save_results()
         self.last_mean_reward = float(record.returns[:, -1].mean())
         self._log(record.returns, record.successes)
         continue_training = True
         if self.last_mean_reward > self.best_mean_reward:
-            best_model = self.best_model_save_path and f"{self.best_model_save_path}/best_model.zip"
-            # A model that could not be written must not keep a later one from being written
-            if best_model is None or self._write(best_model, self.model.save):
+            best_model = f"{self.best_model_save_path}/best_model.zip"
+            with training_goes_on(best_model):
+                if self.best_model_save_path:
+                    self.model.save(best_model)
+                # Not by a model that could not be written, which must not keep a later one from being written
                 self.best_mean_reward = self.last_mean_reward
             if self.callback_on_new_best is not None:
                 continue_training = self.callback_on_new_best.on_step()
@@ -149,19 +148,12 @@ class MetaEvalCallback(EvalCallback):
             continue_training = continue_training and self._on_event()
         return continue_training
 
-    @staticmethod
-    def _write(path: str, save: Callable[[str], None]) -> bool:
-        """Whether it could be written: a disk that is full stops no training."""
-        try:
-            save(path)
-        except OSError as error:
-            warnings.warn(f"{path} could not be written ({reason(error)}). Training goes on.", stacklevel=2)
-            return False
-        return True
-
-    def _save_results(self, path: str) -> None:
+    def _save_results(self) -> None:
+        if self.log_path is None:
+            return
+        path = f"{self.log_path}.npz"
         # Everything so far, so a file that could not be written is made up for by the next one
-        with atomic_path(path) as temporary:
+        with training_goes_on(path), atomic_path(path) as temporary:
             np.savez_compressed(
                 temporary,
                 timesteps=self.evaluations_timesteps,

@@ -17,7 +17,7 @@ from sb3_htr.common.checks import check_is_env, get_task_family
 from sb3_htr.common.random_state import MAX_SEED, kept_env_states, seeded_actions
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.type_aliases import TaskFamily
-from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env, reset_to_tasks
+from sb3_htr.common.vec_env import N_ENVS, family_of, make_task_vec_env, reset_to_tasks
 from sb3_htr.common.vec_wrappers import seed_envs
 
 #: Sets of tasks that a family has
@@ -187,8 +187,7 @@ def record_adaptation(
     tasks = "test" if tasks is None else tasks
     if isinstance(env, str):
         # Of how many tasks, one env tells. Draws depend on the number of envs: the same tasks have it by name and as an array
-        with closing(make_task_vec_env(env)) as one:
-            n_tasks = len(task_set(get_task_family(one), tasks))
+        n_tasks = len(task_set(family_of(env), tasks))
         with closing(make_task_vec_env(env, min(n_tasks, N_ENVS), seed)) as made:
             return record_adaptation(model, made, tasks, n_episodes, explorer, deterministic, seed, on_end)
     check_is_env(env)

@@ -1,8 +1,8 @@
 """Notices at meta-test that rewards are given otherwise than in meta-training."""
 
-import warnings
-
 import numpy as np
+
+from sb3_htr.common.warn_once import WarnOnce
 
 # Times what a success is worth: that of one step may be more than their mean, but not by so much
 LARGER = 5.0
@@ -28,7 +28,7 @@ class RewardWatch:
         # Of all steps so far; of one env alone, they may be successes
         self._least = np.inf
         self._has_ended = np.zeros(n_envs, dtype=bool)
-        self._warned: set[str] = set()
+        self._warn_once = WarnOnce()
 
     def check(self, beside: np.ndarray, dones: np.ndarray) -> None:
         """
@@ -49,10 +49,9 @@ class RewardWatch:
             self._sum[dones] = self._n_steps[dones] = 0
 
     def _warn(self, what: str, value: float, expected: str) -> None:
-        if what not in self._warned:
-            self._warned.add(what)
-            warnings.warn(
-                f"{what} returned {value:.2g} more than meta-training has taught of steps without success, expected "
-                f"{expected}: give rewards as in meta-training, or the agent cannot make sense of them.",
-                stacklevel=5,
-            )
+        self._warn_once(
+            what,
+            f"{what} returned {value:.2g} more than meta-training has taught of steps without success, expected "
+            f"{expected}: give rewards as in meta-training, or the agent cannot make sense of them.",
+            stacklevel=5,
+        )

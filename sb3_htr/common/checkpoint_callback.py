@@ -17,7 +17,7 @@ from stable_baselines3.common.logger import TensorBoardOutputFormat
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.callback import parts_of
 from sb3_htr.common.checkpoint import CHECKPOINTS, checkpoints, n_steps_at, write_checkpoint
-from sb3_htr.common.errors import reason
+from sb3_htr.common.errors import reason, training_goes_on
 from sb3_htr.common.settings import check_numbers, keywords_of
 
 # What is recorded but not written yet
@@ -245,10 +245,8 @@ class CheckpointCallback(BaseCallback):
         # Those of killed processes, too; but never the one just written, which may be behind others that are damaged
         old_ones = [folder for folder in checkpoints(self.run)[self.keep :] if folder != self._written]
         for old in [*old_ones, *(self.run / CHECKPOINTS).glob(".*_steps.*.tmp")]:
-            try:
+            with training_goes_on(f"The old checkpoint {old}", "removed"):
                 shutil.rmtree(old)
-            except OSError as error:
-                warnings.warn(f"The old checkpoint {old} could not be removed ({reason(error)}). Training goes on.")
 
     def _state(self) -> dict[str, Any]:
         return {

@@ -1,4 +1,8 @@
-"""Exceptions by what they are about, and what they say in one line."""
+"""Exceptions by what they are about, what they say in one line, and those that stop no training."""
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 # Of a path that cannot be opened, whatever is in the file
 OPEN_ERRORS = (FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError)
@@ -18,3 +22,17 @@ def reason(error: OSError) -> str:
     :return: in a few words
     """
     return error.strerror or last_line(error)
+
+
+@contextmanager
+def training_goes_on(what: str, done: str = "written") -> Iterator[None]:
+    """
+    Warn where a file cannot be written, as on a disk that is full, in place of an error. What follows within is not done.
+
+    :param what: file, for the message
+    :param done: what should be done with it, likewise
+    """
+    try:
+        yield
+    except OSError as error:
+        warnings.warn(f"{what} could not be {done} ({reason(error)}). Training goes on.", stacklevel=3)

@@ -14,6 +14,14 @@ LOWEST = -sys.float_info.max
 VARIADIC = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
 
 
+def name_of(value: Any) -> Any:
+    """
+    :param value: a name, or a mapping with ``name`` and keyword arguments
+    :return: the name; None for a mapping without one, any other value as it is
+    """
+    return value.get("name") if isinstance(value, Mapping) else value
+
+
 def make(setting: str, value: Any, kinds: Mapping[str, Callable[..., Kind]], base: Any) -> Kind:
     """
     :param setting: what is chosen, for messages
@@ -25,14 +33,13 @@ def make(setting: str, value: Any, kinds: Mapping[str, Callable[..., Kind]], bas
     """
     if isinstance(value, base):
         return cast(Kind, value)
-    given = {"name": value} if isinstance(value, str) else value
-    name = given.get("name") if isinstance(given, Mapping) else None
+    name = name_of(value)
     if not isinstance(name, str) or name not in kinds:
         raise ValueError(
             f"{setting} is {value!r}, expected one of {sorted(kinds)}, {{'name': one of them, and its settings}}, or an "
             f"object derived from {base.__name__}."
         )
-    settings = {key: item for key, item in given.items() if key != "name"}
+    settings = {key: item for key, item in value.items() if key != "name"} if isinstance(value, Mapping) else {}
     check_keywords(f"{setting} {name!r}", settings, kinds[name])
     return kinds[name](**settings)
 

@@ -4,6 +4,7 @@ import importlib
 import os
 import signal
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from typing import Any, cast
 
 import gymnasium as gym
@@ -12,8 +13,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_htr.common.checks import check_has_task_family, check_tasks, tells_rewards
+from sb3_htr.common.checks import check_has_task_family, check_tasks, get_task_family, tells_rewards
 from sb3_htr.common.settings import check_numbers
+from sb3_htr.common.type_aliases import TaskFamily
 from sb3_htr.common.vec_wrappers import PatientResultsWriter, TaskVecMonitor
 
 # Side by side, where nobody says how many
@@ -213,3 +215,13 @@ def make_task_vec_env(
     if seed is not None:
         monitored.seed(seed)
     return monitored
+
+
+def family_of(env_id: str, env_kwargs: dict[str, Any] | None = None) -> TaskFamily:
+    """
+    :param env_id: registered env
+    :param env_kwargs: arguments of the env
+    :return: its task family
+    """
+    with closing(make_task_vec_env(env_id, env_kwargs=env_kwargs)) as single:
+        return get_task_family(single)

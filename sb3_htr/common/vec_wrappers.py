@@ -3,7 +3,6 @@
 import contextlib
 import copy
 import inspect
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,7 +12,7 @@ from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_htr.common.errors import reason
+from sb3_htr.common.errors import training_goes_on
 from sb3_htr.common.random_state import checked_seed
 
 
@@ -21,10 +20,8 @@ class PatientResultsWriter(ResultsWriter):
     """Writes SB3's monitor file as long as that is possible: a disk that is full stops no training."""
 
     def write_row(self, epinfo: dict[str, float]) -> None:
-        try:
+        with training_goes_on(self.file_handler.name):
             super().write_row(epinfo)
-        except OSError as error:
-            warnings.warn(f"{self.file_handler.name} could not be written ({reason(error)}). Training goes on.")
 
     def close(self) -> None:
         with contextlib.suppress(OSError):  # what could not be written before

@@ -1,14 +1,12 @@
 """Are the reward model's probabilities of success what they say?"""
 
-from contextlib import closing
-
 import numpy as np
 import torch as th
 
 from sb3_htr.adaptation.loop import adaptation_steps
-from sb3_htr.common.checks import get_task_family, tells_rewards
+from sb3_htr.common.checks import tells_rewards
 from sb3_htr.common.type_aliases import Context, Trajectory
-from sb3_htr.common.vec_env import make_task_vec_env, reset_to_tasks
+from sb3_htr.common.vec_env import family_of, make_task_vec_env, reset_to_tasks
 from sb3_htr.experiments.cell import KwArgs
 from sb3_htr.htr.groups import evenly_spread
 from sb3_htr.pearl.pearl import PEARL
@@ -30,8 +28,7 @@ def calibration(model: Model, env_id: str, env_kwargs: KwArgs, n_episodes: int) 
     :return: (N_BINS, 3) float64, of the pairs whose probability is in a bin: how many, sum of probabilities, successes. No
         pairs for a model without a reward model, and for a family without successes
     """
-    with closing(make_task_vec_env(env_id, env_kwargs=env_kwargs)) as single:
-        family = get_task_family(single)
+    family = family_of(env_id, env_kwargs)
     if not isinstance(model, PEARL) or not tells_rewards(family):
         return np.zeros((N_BINS, 3))
     tasks = family.validation_tasks

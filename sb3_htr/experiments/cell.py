@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sb3_htr.common.arrays import load_arrays
-
-# What to do with raw results that cannot be used
+# What to do with raw results that cannot be used, and with those of something else
 REMOVE = "Remove it: the same command then evaluates its run again, without training it again."
+MOVE = "move it away with its run, or choose other --runs."
 
 KwArgs = dict[str, Any]
 
@@ -112,22 +111,14 @@ class Cell:
         names = ("env_id", "env_kwargs", "method", "settings", "seed", "n_timesteps", "n_episodes", "eval_freq")
         return json.dumps({name: getattr(self, name) for name in names}, sort_keys=True)
 
-    def check_result(self, path: Path) -> None:
-        """
-        :param path: raw results; those of older versions say less of what they are of, or nothing
-        :raises ValueError: if they are of something else
-        """
-        advice = "move it away with its run, or choose other --runs."
-        self.check_facts(load_arrays(path, advice=REMOVE), str(path), advice)
-
     def check_facts(self, raw: Mapping[str, Any], what: str, advice: str) -> None:
         """
-        :param raw: raw results
+        :param raw: raw results; those of older versions may say less of what they are of
         :param what: they are, for the message
         :param advice: what to do if they are of something else, likewise
         :raises ValueError: if they are
         """
-        given, own = json.loads(str(raw["cell"])) if "cell" in raw else {}, json.loads(self.facts())
+        given, own = json.loads(str(raw["cell"])), json.loads(self.facts())
         if different := [name for name, value in given.items() if value != own.get(name)]:
             name = different[0]
             raise ValueError(f"{what} has {name} {given[name]!r}, but {self.label} needs {own.get(name)!r}: {advice}")

@@ -12,8 +12,9 @@ from htr_envs.point_robot import STEP_SIZE, PointRobotFamily
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.experiments.calibration import expected_calibration_error
 from sb3_htr.experiments.cell import Cell
-from sb3_htr.experiments.protocol import scores
-from sb3_htr.zoo.plots.curves import band, finish
+from sb3_htr.experiments.protocol import SOLVED_SHARE, scores
+from sb3_htr.experiments.runner import in_training
+from sb3_htr.zoo.plots.curves import OF_FEW, band, finish
 from sb3_htr.zoo.plots.intervals import iqm_interval
 from sb3_htr.zoo.plots.style import BLUE, GREY, curve_colours, save
 
@@ -48,7 +49,8 @@ def n_seeds(results: Results) -> int:
 
 def _title(results: Results) -> str:
     n = n_seeds(results)
-    return f"{next(iter(results)).env_id}: {'one seed' if n == 1 else f'IQM over {n} seeds'}, 95 % interval"
+    few = {1: "one seed, 95 % interval over tasks and evaluation seeds", **OF_FEW}
+    return f"{next(iter(results)).env_id}: {few.get(n, f'IQM over {n} seeds, 95 % interval')}"
 
 
 def label(variant: str, runs: list[tuple[Cell, Any]], results: Results) -> str:
@@ -73,8 +75,8 @@ def curves(runs: Sequence[Any], key: str) -> tuple[np.ndarray, np.ndarray]:
 
 def learning(results: Results, path: Path) -> None:
     """
-    Left: learning curves on validation tasks. Right: the final models' adaptation to the test tasks, by the first explorer of
-    each and by the prior.
+    Left: learning curves on validation tasks. Right: the final models' adaptation to the test tasks, by the same explorer and
+    by the prior.
 
     :param results: raw results of the cells
     :param path: picture to write
@@ -83,10 +85,10 @@ def learning(results: Results, path: Path) -> None:
     groups = by_variant(results)
     for colour, (variant, runs) in zip(curve_colours([*groups]), groups.items(), strict=True):
         timesteps, curve = curves([raw for _, raw in runs], "curve")
-        name = label(variant, runs, results)
-        band(left, timesteps / 1000, curve, colour, "-", name)
+        name, own = label(variant, runs, results), in_training(runs[0][0]).explorer
+        band(left, timesteps / 1000, curve, colour, "-", f"{name}, {own}")
         explorers = [evaluation.explorer for evaluation in runs[0][0].evaluations if not evaluation.tested_on]
-        styles = {"prior": "--", **dict.fromkeys(explorers[:1], "-")}
+        styles = {"prior": "--", own: "-"}
         for explorer in [explorer for explorer in explorers if explorer in styles]:
             returns = np.stack([raw[f"returns_{explorer}"] for _, raw in runs])
             band(right, np.arange(1, returns.shape[-1] + 1), returns, colour, styles[explorer], f"{name}, {explorer}")
@@ -113,16 +115,17 @@ def race(results: Results, path: Path) -> None:
     groups = by_variant(results)
     for colour, (variant, runs) in zip(curve_colours([*groups]), groups.items(), strict=True):
         timesteps, solved = curves([raw for _, raw in runs], "solved")
-        name = f"{label(variant, runs, results)}, {runs[0][0].evaluations[0].explorer}"
-        band(left, timesteps / 1000, 100 * solved, colour, "-", name)
+        name = f"{label(variant, runs, results)}, {in_training(runs[0][0]).explorer}"
+        band(left, timesteps / 1000, 100 * solved, colour, "-", name, alpha=0.08)
         minutes = np.median([raw["elapsed_s"][: len(timesteps)] for _, raw in runs], axis=0) / 60
-        band(right, minutes, 100 * solved, colour, "-", f"_{name}")
+        band(right, minutes, 100 * solved, colour, "-", f"_{name}", alpha=0.08)
     for axes in (left, right):
         axes.set_xscale("log")
+        axes.axhline(100 * SOLVED_SHARE, color=GREY, linestyle=":", linewidth=1)
         axes.xaxis.set_major_formatter("{x:g}")
     left.set_xlabel("thousand env steps of meta-training")
     right.set_xlabel("minutes of meta-training, with evaluations")
-    left.set_ylabel("validation tasks solved in the last episode (%)")
+    left.set_ylabel("validation tasks solved (%)")
     finish(figure, path, _title(results))
 
 
@@ -201,7 +204,7 @@ def relabelling(results: Results, path: Path) -> None:
     shown = [variant for variant in groups if variant == "K = 0.8" or not variant.startswith("K = ")]
     for colour, variant in zip(curve_colours(shown), shown, strict=True):
         timesteps, curve = curves(groups[variant], "curve")
-        band(right, timesteps / 1000, curve, colour, "-", variant)
+        band(right, timesteps / 1000, curve, colour, "-", "even, K = 0.8, the default" if variant == "K = 0.8" else variant)
     right.set_xlabel("thousand env steps of meta-training")
     right.set_ylabel("return of the last adaptation episode")
     right.set_title("validation tasks, hindsight task strategies and ablation", fontsize=10)

@@ -4,15 +4,13 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
-import yaml
-
 from sb3_htr.experiments import figures
 from sb3_htr.experiments.ablations import ABLATIONS
 from sb3_htr.experiments.cell import Cell, Evaluation, KwArgs
 from sb3_htr.experiments.tuned import TUNED_DENSE, TUNED_HFR, TUNED_HIPI, TUNED_RL2
 from sb3_htr.zoo.run.agents import WRAPPERS
 from sb3_htr.zoo.run.method import get_method
-from sb3_htr.zoo.run.shipped import hyperparams_file
+from sb3_htr.zoo.run.shipped import block_of
 
 EXPLORERS = ("belief", "learned-prior", "aggregate", "prior")
 BELIEF = ("belief",)
@@ -149,11 +147,10 @@ def replay(**settings: Any) -> dict[str, Any]:
 def settings_of(file: str, env_id: str = "default") -> KwArgs:
     """
     :param file: name of a YAML file of the package
-    :param env_id: an env that has a block of its own in it; by default what the file says for all others
+    :param env_id: registered env; by default any that has no block of its own in it
     :return: what it says, but for what an experiment and its methods say themselves
     """
-    block: KwArgs = yaml.safe_load(hyperparams_file(file).read_text())[env_id]
-    return {key: value for key, value in block.items() if key not in ("policy", "method", "n_timesteps")}
+    return {key: value for key, value in block_of(file, env_id).items() if key not in ("policy", "n_timesteps")}
 
 
 def under_prior(env_id: str = "default", end: str = "-prior") -> tuple[Variant, ...]:

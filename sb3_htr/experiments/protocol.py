@@ -1,7 +1,6 @@
 """How every final model is judged: on test tasks that decided nothing, with several seeds, by each explorer alike."""
 
 from collections.abc import Callable, Mapping
-from contextlib import closing
 from functools import partial
 from typing import Any
 
@@ -9,8 +8,8 @@ import numpy as np
 
 from sb3_htr.adaptation.evaluation import evaluate_adaptation, first_success
 from sb3_htr.adaptation.explorers import Explorer, Prior, to_explorer
-from sb3_htr.common.checks import get_task_family
-from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.common.settings import name_of
+from sb3_htr.common.vec_env import family_of, make_task_vec_env
 from sb3_htr.experiments.ablations import ABLATIONS
 from sb3_htr.experiments.calibration import calibration
 from sb3_htr.experiments.cell import Cell, Evaluation, KwArgs
@@ -64,9 +63,7 @@ def check_evaluations(cell: Cell, trained_with: Any = None) -> None:
 
 def _evaluate_by(evaluation: Evaluation, cell: Cell, model: Model, trained_with: Any) -> KwArgs:
     env_kwargs = {**cell.env_kwargs, **evaluation.tested_on}
-    with closing(make_task_vec_env(cell.env_id, env_kwargs=env_kwargs)) as single:
-        family = get_task_family(single)
-    env = make_task_vec_env(cell.env_id, len(family.test_tasks), env_kwargs=env_kwargs)
+    env = make_task_vec_env(cell.env_id, len(family_of(cell.env_id, env_kwargs).test_tasks), env_kwargs=env_kwargs)
     explorer = _explorer(evaluation.explorer, trained_with)
     records = [
         evaluate_adaptation(model, env, n_episodes=cell.n_episodes, explorer=explorer, seed=seed) for seed in EVAL_SEEDS
@@ -79,8 +76,7 @@ def _evaluate_by(evaluation: Evaluation, cell: Cell, model: Model, trained_with:
 def _explorer(name: str, trained_with: Any) -> Any:
     if name in EXPERIMENTAL or name == OWN:
         return EXPERIMENTAL.get(name, name)
-    is_meant = isinstance(trained_with, Mapping) and trained_with.get("name") == name
-    return to_explorer(trained_with if is_meant else name)
+    return to_explorer(trained_with if name_of(trained_with) == name else name)
 
 
 def last_episode_return(raw: Raw, evaluation: str) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.experiments.cell import REMOVE, Cell, KwArgs
+from sb3_htr.experiments.cell import Cell, KwArgs
 from sb3_htr.experiments.runner import LOGGED, hyperparams_of
 
 # Of the code that trained, and of that which evaluated
@@ -27,17 +27,6 @@ def needed(cell: Cell) -> tuple[str, ...]:
     return *NEEDED, *(f"returns_{evaluation.name}" for evaluation in cell.evaluations)
 
 
-def load(cell: Cell, path: Path) -> dict[str, Any]:
-    """
-    :param cell: of an experiment
-    :param path: its raw results
-    :return: arrays
-    :raises ValueError: if they are damaged, of something else, or lack something, as those of older versions do
-    """
-    cell.check_result(path)
-    return load_arrays(path, needed(cell), f"It may be of another version. {REMOVE}")
-
-
 def differing(one: KwArgs, other: KwArgs) -> list[str]:
     """
     :param one: hyperparameters
@@ -52,6 +41,28 @@ def differing(one: KwArgs, other: KwArgs) -> list[str]:
         elif ours != theirs:
             names.append(key)
     return names
+
+
+def check(cell: Cell, raw: Mapping[str, Any], what: str, advice: str, if_lacking: str = "") -> None:
+    """
+    :param cell: of an experiment
+    :param raw: raw results
+    :param what: they are, for the message
+    :param advice: what to do if they are not of the cell, likewise
+    :param if_lacking: another one, if they lack something
+    :raises ValueError: if they are of something else, were trained with other hyperparameters than the cell would be, or lack
+        something, be it what they are of, as those of older versions do
+    """
+    missing = sorted({"cell", "hyperparams", *needed(cell)} - raw.keys())
+    if "cell" not in missing:  # what is of something else may lack what it never needed
+        cell.check_facts(raw, what, advice)
+    if missing:
+        raise ValueError(f"{what} lacks {missing}, which {cell.experiment} needs: {if_lacking or advice}")
+    if different := differing(json.loads(str(raw["hyperparams"])), hyperparams_of(cell)):
+        raise ValueError(
+            f"{what} was trained with other {different} than {cell.label} would be: has a YAML file changed in between? "
+            f"Restore it, or {advice}"
+        )
 
 
 def pack(results: Mapping[Cell, Path], folder: Path) -> None:
@@ -78,22 +89,17 @@ def unpack(folder: Path, cells: Sequence[Cell], runs: Path) -> int:
     :param cells: of an experiment
     :param runs: folder of all experiments' runs
     :return: how many of the runs the folder has
-    :raises ValueError: if it has none of them, or has one that is of something else, that was trained with other
-        hyperparameters, or that lacks something, be it what it is of
+    :raises ValueError: if it has none of them, one that is not of its cell, see :func:`check`, or damaged files
     """
-    load_method = cache(lambda path: load_arrays(path) if path.exists() else {})
+    advice = "leave the folder out of --with-results."
+    load_method = cache(lambda path: load_arrays(path, advice=advice.capitalize()) if path.exists() else {})
     found: dict[Cell, dict[str, Any]] = {}
     for cell in cells:
         path, start = _packed(folder, cell.method), f"{cell.name}/"
         raw = {key.removeprefix(start): value for key, value in load_method(path).items() if key.startswith(start)}
         if not raw:
             continue
-        what, advice = f"{cell.name} in {path}", "leave the folder out of --with-results."
-        if missing := sorted({"cell", "hyperparams", *needed(cell)} - set(raw)):
-            raise ValueError(f"{what} lacks {missing}, which {cell.experiment} needs: {advice}")
-        cell.check_facts(raw, what, advice)
-        if different := differing(json.loads(str(raw["hyperparams"])), hyperparams_of(cell)):
-            raise ValueError(f"{what} was trained with other {different} than {cell.experiment} would: {advice}")
+        check(cell, raw, f"{cell.name} in {path}", advice)
         found[cell] = raw
     if not found:
         expected = f"raw-METHOD.npz with runs such as {cells[0].name}"

@@ -13,10 +13,10 @@ from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.versions import UNKNOWN_HARDWARE
 from sb3_htr.experiments import raw_results
 from sb3_htr.experiments.calibration import expected_calibration_error
-from sb3_htr.experiments.cell import Cell, Evaluation
+from sb3_htr.experiments.cell import MOVE, REMOVE, Cell, Evaluation
 from sb3_htr.experiments.grid import Experiment
 from sb3_htr.experiments.protocol import EVAL_SEEDS, METRICS, OF_TRAINING, TIMES, env_steps_to_solved, is_solved, scores
-from sb3_htr.experiments.runner import LOGGED, hyperparams_of
+from sb3_htr.experiments.runner import LOGGED, in_training
 from sb3_htr.experiments.table import table
 from sb3_htr.zoo.plots.intervals import iqm_difference, iqm_interval
 
@@ -43,9 +43,7 @@ class Runs(NamedTuple):
     @property
     def in_training(self) -> Evaluation:
         """The one that is by the explorer of the training's own evaluations."""
-        explorer = hyperparams_of(self.cells[0]).get("explorer")
-        name = explorer["name"] if isinstance(explorer, dict) else explorer
-        return next((own for own in self.evaluations if own.explorer == name and not own.tested_on), self.evaluations[0])
+        return in_training(self.cells[0])
 
     def returns(self, evaluation: Evaluation) -> np.ndarray:
         """(n_runs, n_eval_seeds, n_tasks), of the last adaptation episode."""
@@ -151,17 +149,11 @@ def _rounded(interval: tuple[float, float, float]) -> dict[str, float]:
 def check(results: dict[Cell, Path]) -> None:
     """
     :param results: raw results of cells
-    :raises ValueError: if one is damaged, of something else, lacks something, as those of older versions do, or was trained
-        with other hyperparameters than its cell would be
+    :raises ValueError: if one is damaged, or not of its cell, see :func:`sb3_htr.experiments.raw_results.check`
     """
     for cell, path in results.items():
-        # Older ones do not say
-        own = json.loads(str(raw_results.load(cell, path).get("hyperparams", "null")))
-        if own and (different := raw_results.differing(own, hyperparams_of(cell))):
-            raise ValueError(
-                f"{path} was trained with other {different} than {cell.label} would be: has a YAML file changed in between? "
-                "Restore it, move this file away with its run, or choose other --runs."
-            )
+        raw = load_arrays(path, advice=REMOVE)
+        raw_results.check(cell, raw, str(path), MOVE, f"it may be of another version. {REMOVE}")
 
 
 def write(command: str, experiment: Experiment, results: dict[Cell, Path], folder: Path) -> None:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import yaml
 from filelock import Timeout
 
 import htr_envs  # noqa: F401 registers the envs
@@ -15,8 +14,9 @@ from htr_envs.goal_env import find_hidden
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checkpoint import checkpoints
+from sb3_htr.common.settings import name_of
 from sb3_htr.common.versions import UNKNOWN_HARDWARE, commit, hardware, named, versions
-from sb3_htr.experiments.cell import Cell
+from sb3_htr.experiments.cell import MOVE, REMOVE, Cell, Evaluation
 from sb3_htr.experiments.evaluation_cache import FOLDER, EvaluationCache, digest_of_code
 from sb3_htr.experiments.log import logged
 from sb3_htr.experiments.protocol import check_evaluations, evaluate
@@ -26,6 +26,7 @@ from sb3_htr.zoo.run.algorithm import Model
 from sb3_htr.zoo.run.folder import SystemLock, run_number
 from sb3_htr.zoo.run.method import get_method, merged
 from sb3_htr.zoo.run.record import RECORD, read_record
+from sb3_htr.zoo.run.shipped import block_of
 from sb3_htr.zoo.run.time_to_learned import seconds_at
 from sb3_htr.zoo.run.train_arguments import training_facts
 from sb3_htr.zoo.run.trust import import_packages, plain_settings
@@ -85,7 +86,7 @@ def run_cell(cell: Cell, runs: Path) -> bool:
     try:
         with lock_of(cell, runs).acquire(timeout=0):
             if result.exists():
-                cell.check_result(result)
+                cell.check_facts(load_arrays(result, ("cell",), REMOVE), str(result), MOVE)
             else:
                 with logged(folder / "log.txt"):
                     arrays = _train_and_evaluate(cell, folder)
@@ -169,10 +170,18 @@ def hyperparams_of(cell: Cell) -> dict[str, Any]:
     :return: hyperparameters that it is trained with, as its record will have them
     """
     method = get_method(cell.method)
-    blocks = yaml.safe_load(Path(method.algorithm.settings_file).read_text())
-    of_env = {key: value for key, value in blocks.get(cell.env_id, blocks["default"]).items() if key != "method"}
+    of_env = block_of(method.algorithm.settings, cell.env_id)
     used = {**merged(method.settings(of_env), cell.settings), "n_timesteps": cell.n_timesteps}
     return cast(dict[str, Any], json.loads(json.dumps(used, default=str)))  # which knows no tuples
+
+
+def in_training(cell: Cell) -> Evaluation:
+    """
+    :param cell: of an experiment
+    :return: which of its evaluations is by the explorer of those during its training; its first one if none is
+    """
+    name = name_of(hyperparams_of(cell).get("explorer"))
+    return next((own for own in cell.evaluations if own.explorer == name and not own.tested_on), cell.evaluations[0])
 
 
 def _planned(cell: Cell) -> dict[str, Any]:

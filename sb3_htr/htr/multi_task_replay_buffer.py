@@ -59,7 +59,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         their task while the context stays sparse
     :param context_episodes: without relabelling, the context is drawn from this many latest episodes of the task.
         PEARL's reference has those of its latest collection; by measurement on the Wheeled robot, where that is two, the dense
-        proxy learns better from ten, and for HTR it makes no difference
+        proxy learns better from ten, and for HTR no difference is shown
     :param seed: seed of the buffer's own random generators
     :raises ValueError: for a setting that is unknown or out of its range, a family without the hooks that it needs, and a
         capacity below one episode of each task
@@ -100,6 +100,8 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         # ReplayBuffer's own constructor would allocate everything at once
         BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_envs)
         self.task_family = task_family
+        #: Whether the task family tells rewards and successes of any step under any task
+        self.tells_rewards = tells_rewards(task_family)
         self.max_episode_steps = max_episode_steps
         self.relabel_probability = relabel_probability
         self.rl_reward_type = rl_reward_type
@@ -115,7 +117,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         self.relabeller.bind(self)
         # Told of every finished episode: the training task that it was collected on, and its transitions
         self.episode_listeners: list[Callable[[int, np.ndarray], None]] = []
-        if self.tells_rewards and relabel_probability > 0:
+        if relabel_probability > 0:
             self.episode_listeners.append(self.relabeller.on_episode)
 
     def seed(self, seed: int | None) -> None:
@@ -128,11 +130,6 @@ class MultiTaskReplayBuffer(ReplayBuffer):
     def _relabelled_by(self) -> str:
         """Name of the relabeller, if it has experience of its own."""
         return type(self.relabeller).__name__ if self.relabeller.keeps_experience and self.relabel_probability > 0 else ""
-
-    @property
-    def tells_rewards(self) -> bool:
-        """Whether the task family tells rewards and successes of any step under any task."""
-        return tells_rewards(self.task_family)
 
     @property
     def n_tasks(self) -> int:

@@ -1,9 +1,10 @@
 """Notices that learning has gone wrong, before a run is lost to it."""
 
-import warnings
 from collections.abc import Mapping
 
 from torch import nn
+
+from sb3_htr.common.warn_once import WarnOnce
 
 # Mean KL divergence of the posterior from N(0, I), in nats: below, z says nothing about the task; above, it is no probability
 # that floats can handle. A task takes 5 to 25 nats on the envs of this package.
@@ -33,22 +34,17 @@ def check_not_diverged(networks: nn.Module, losses: Mapping[str, float], n_updat
         raise DivergedError(f"The weights {bad[0]} are not finite {where}: {advice}.")
 
 
-class PosteriorWatch:
-    """Warns once for each way in which the posterior can stop being of use."""
+def check_posterior(kl_divergence: float, warn_once: WarnOnce) -> None:
+    """
+    Warns once for each way in which the posterior can stop being of use.
 
-    def __init__(self) -> None:
-        self._warned: set[str] = set()
-
-    def check(self, kl_divergence: float) -> None:
-        """
-        :param kl_divergence: mean over the latest updates, in nats
-        """
-        if kl_divergence < COLLAPSED:
-            self._warn("collapsed: z says nothing about the task. Lower kl_coef, or relabel more often", kl_divergence)
-        elif kl_divergence > EXPLODED:
-            self._warn("exploded: z is far from anything that the prior covers. Raise kl_coef", kl_divergence)
-
-    def _warn(self, what: str, kl_divergence: float) -> None:
-        if what not in self._warned:
-            self._warned.add(what)
-            warnings.warn(f"The posterior has {what} (KL divergence from the prior {kl_divergence:.3g} nats).", stacklevel=4)
+    :param kl_divergence: mean over the latest updates, in nats
+    :param warn_once: of the model
+    """
+    if kl_divergence < COLLAPSED:
+        what = "collapsed: z says nothing about the task. Lower kl_coef, or relabel more often"
+    elif kl_divergence > EXPLODED:
+        what = "exploded: z is far from anything that the prior covers. Raise kl_coef"
+    else:
+        return
+    warn_once(what, f"The posterior has {what} (KL divergence from the prior {kl_divergence:.3g} nats).", stacklevel=3)

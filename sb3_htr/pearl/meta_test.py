@@ -20,6 +20,7 @@ from sb3_htr.common import checks
 from sb3_htr.common.latent_policy import Obs, State
 from sb3_htr.common.random_state import MAX_SEED, seeded_actions
 from sb3_htr.common.settings import check_numbers
+from sb3_htr.common.warn_once import WarnOnce
 from sb3_htr.pearl.policies import PEARLPolicy
 
 
@@ -32,7 +33,7 @@ class MetaTest(SAC):
     knowledge: LatentKnowledge
     #: Of training; None if the model has had no env yet
     max_episode_steps: int | None
-    _warned_not_adapted = False
+    _warn_once: WarnOnce
 
     def check_env(self, env: VecEnv) -> None:
         """
@@ -190,9 +191,9 @@ class MetaTest(SAC):
         :param deterministic: mean action instead of a sample
         :return: actions, and the state for the next call
         """
-        if state is None and not self._warned_not_adapted:
-            self._warned_not_adapted = True
-            warnings.warn(
+        if state is None:
+            self._warn_once(
+                "not adapted",
                 "This PEARL is not adapted to any task, so it acts with the prior mean of z. To see what it can do, use "
                 "sb3_htr.evaluate_adaptation(model, env), or evaluate_policy(model.adapt(env), env).",
                 stacklevel=2,
@@ -200,7 +201,7 @@ class MetaTest(SAC):
         return self.policy.predict(observation, state, episode_start, deterministic)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "knowledge", "_warned_not_adapted"]
+        return [*super()._excluded_save_params(), "knowledge", "_warn_once"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

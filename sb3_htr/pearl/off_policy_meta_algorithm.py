@@ -35,6 +35,7 @@ from sb3_htr.common.settings import check_class, check_keywords, check_mappings,
 from sb3_htr.common.training_state import Resumable
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.common.vec_wrappers import in_float32, seed_envs
+from sb3_htr.common.warn_once import WarnOnce
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.htr.reward_hook import check_reward_hook
 from sb3_htr.pearl.horizon import BY_HORIZON, STEPS_PER_UPDATE, complete, timesteps_for
@@ -144,6 +145,7 @@ class OffPolicyMetaAlgorithm(MetaTest, ReplayFiles, CheckedFiles, SAC):
         #: Called after each update
         self.update_listeners: list[Callable[[], None]] = []
         self._n_rollouts = 0
+        self._warn_once = WarnOnce()
 
     def _setup_model(self) -> None:
         if self.env is None and not hasattr(self, "observation_space"):
@@ -230,6 +232,8 @@ class OffPolicyMetaAlgorithm(MetaTest, ReplayFiles, CheckedFiles, SAC):
         )
         task_bank = TaskBank(family, replay_buffer.transitions, self.context_size, self.seed)
         replay_buffer.episode_listeners.append(task_bank.on_episode)
+        for explorer in (self.explorer, self.train_explorer):
+            self._check_explorer(explorer, replay_buffer.tells_rewards)
         return replay_buffer, task_bank
 
     def _take_replay(self, replay_buffer: MultiTaskReplayBuffer, task_bank: TaskBank) -> None:
@@ -248,8 +252,6 @@ class OffPolicyMetaAlgorithm(MetaTest, ReplayFiles, CheckedFiles, SAC):
         if self.replay_buffer is not None:
             self.replay_buffer.relabeller.policy = self.policy
             self.knowledge.set_tells_rewards(self.replay_buffer.tells_rewards)
-            for explorer in (self.explorer, self.train_explorer):
-                self._check_explorer(explorer, self.knowledge.tells_rewards)
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
@@ -279,8 +281,6 @@ class OffPolicyMetaAlgorithm(MetaTest, ReplayFiles, CheckedFiles, SAC):
             return
         # All that can be refused, before anything is taken
         replay_buffer, task_bank = self._make_replay(vec_env)
-        for explorer in (self.explorer, self.train_explorer):
-            self._check_explorer(explorer, replay_buffer.tells_rewards)
         super().set_env(vec_env, force_reset)
         self._take_replay(replay_buffer, task_bank)
         self._introduce_policy()

@@ -13,7 +13,7 @@ from sb3_htr.common.segments import repeat_segments
 from sb3_htr.common.settings import LOWEST, check_flags, check_numbers
 from sb3_htr.common.type_aliases import MultiTaskSamples, RewardLabels
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
-from sb3_htr.pearl.divergence import PosteriorWatch, check_not_diverged
+from sb3_htr.pearl.divergence import check_not_diverged, check_posterior
 from sb3_htr.pearl.encoder import ContextEncoder, kl_to_prior
 from sb3_htr.pearl.graphed_update import FixedUpdate, GraphedUpdate, Outcome, can_be_captured
 from sb3_htr.pearl.matmul import PRECISIONS, matmul_precision
@@ -176,7 +176,6 @@ class PEARL(OffPolicyMetaAlgorithm):
         self.reward_coef = reward_coef
         self.matmul_precision = matmul_precision
         self.cuda_graph = cuda_graph
-        self._posterior_watch = PosteriorWatch()
         if _init_setup_model:
             self._setup_model()
 
@@ -234,7 +233,7 @@ class PEARL(OffPolicyMetaAlgorithm):
             means, logs = zip(*(self._update(batch_size, fixed) for _ in range(gradient_steps)), strict=True)
         log_means = {key: th.stack([log[key] for log in logs]).mean().item() for key in logs[0]}
         check_not_diverged(self.policy, log_means, self._n_updates, self.num_timesteps)
-        self._posterior_watch.check(log_means["kl_divergence"])
+        check_posterior(log_means["kl_divergence"], self._warn_once)
         for key, value in log_means.items():
             self.logger.record(f"train/{key}", value)
         for key, value in self.replay_buffer.stats().items():
@@ -365,7 +364,7 @@ class PEARL(OffPolicyMetaAlgorithm):
         }
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "encoder", "reward_model", "_posterior_watch"]
+        return [*super()._excluded_save_params(), "encoder", "reward_model"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

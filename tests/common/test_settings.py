@@ -8,7 +8,7 @@ import pytest
 
 from sb3_htr.adaptation import Aggregate, Belief, Explorer, Prior
 from sb3_htr.adaptation.explorers import EXPLORERS, to_explorer
-from sb3_htr.common.settings import check_numbers, make
+from sb3_htr.common.settings import check_numbers, make, name_of
 from sb3_htr.htr import Relabeller
 from sb3_htr.htr.relabel import RELABELLERS
 
@@ -21,6 +21,8 @@ def test_a_name_a_name_with_settings_and_an_object_are_the_same() -> None:
     assert to_explorer("belief") == Belief() and to_explorer({"name": "belief", "margin": 2}) == own
     assert to_explorer({"name": "prior", "n_exploration_episodes": 9}) == Prior(9)
     assert type(to_explorer("aggregate")) is Aggregate
+    assert name_of("belief") == name_of({"name": "belief", "margin": 2}) == "belief"
+    assert name_of({"margin": 2}) is None and name_of(own) is own
 
 
 @pytest.mark.parametrize(

@@ -48,7 +48,7 @@ def trains(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Cell, Path], 
         def train_and_evaluate(cell: Cell, folder: Path) -> Arrays:
             trained.append(cell.name)
             function(cell, folder)
-            return {"seed": cell.seed}
+            return {"cell": cell.facts(), "seed": cell.seed}
 
         monkeypatch.setattr("sb3_htr.experiments.runner._train_and_evaluate", train_and_evaluate)
         return trained

@@ -70,6 +70,10 @@ def test_runs_of_something_else_are_not_taken(published: Path) -> None:
     others = [replace(cell, n_timesteps=960) for cell in cells]
     with pytest.raises(ValueError, match=r"htr-ser-seed1 in .* has n_timesteps 480, but theirs/.* needs 960: leave"):
         raw_results.unpack(published, others, Path("runs"))
+    # Also where it lacks what the other thing needs
+    others = [replace(cell, n_timesteps=960, evaluations=by(("belief",))) for cell in cells]
+    with pytest.raises(ValueError, match=r"htr-ser-seed1 in .* has n_timesteps 480, but theirs/.* needs 960: leave"):
+        raw_results.unpack(published, others, Path("runs"))
     others = [replace(cell, evaluations=by(("belief",))) for cell in cells]
     with pytest.raises(ValueError, match=r"htr-ser-seed1 in .* lacks \['returns_belief'\], which theirs needs: leave"):
         raw_results.unpack(published, others, Path("runs"))
@@ -87,10 +91,13 @@ def test_runs_of_something_else_are_not_taken(published: Path) -> None:
         ({"cell": None}, r"htr-ser-seed1 in .* lacks \['cell'\], which theirs needs: leave the folder out"),
         ({"hyperparams": None}, r"lacks \['hyperparams'\]"),
         # As where a YAML file has changed since
-        ({"hyperparams": json.dumps({"gamma": 0.5})}, r"was trained with other \[.*'gamma'.*\] than theirs would: leave"),
+        (
+            {"hyperparams": json.dumps({"gamma": 0.5})},
+            r"was trained with other \[.*'gamma'.*\] than theirs/.*-seed1 would be: has .*\? Restore it, or leave",
+        ),
         (
             {"hyperparams": json.dumps({"replay_buffer_kwargs": {"context_episodes": 7}})},
-            r"was trained with other \[.*'replay_buffer_kwargs.context_episodes'.*\] than theirs would: leave",
+            r"was trained with other \[.*'replay_buffer_kwargs.context_episodes'.*\] than theirs/.* would be: has .*\?",
         ),
     ],
 )
@@ -104,6 +111,14 @@ def test_runs_must_say_what_they_are_of(changed: dict[str, str | None], message:
     np.savez(path, **raw)
     with pytest.raises(ValueError, match=message):
         raw_results.unpack(published, grid.EXPERIMENTS["theirs"].cells(), Path("runs"))
+
+
+def test_damaged_results_of_others_are_named(published: Path) -> None:
+    path = published / "raw-rl2.npz"
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(ValueError, match=r"raw-rl2\.npz is damaged, or no npz file\. Leave the folder out of --with-results"):
+        raw_results.unpack(published, grid.EXPERIMENTS["theirs"].cells(), Path("runs"))
+    assert not Path("runs").exists()
 
 
 def test_results_do_not_replace_those_of_more_runs(published: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -221,7 +221,11 @@ def test_results_of_other_settings_are_not_taken_for_those_of_a_cell(tmp_path: P
     ):
         with pytest.raises(ValueError, match="move it away with its run"):
             run_cell(other, tmp_path)
-    cell.result(tmp_path).unlink()
+    result = cell.result(tmp_path)
+    np.savez(result, **{key: value for key, value in np.load(result).items() if key != "cell"})
+    with pytest.raises(ValueError, match=r"lacks \['cell'\]\. Remove it: the same command then evaluates its run again"):
+        run_cell(cell, tmp_path)
+    result.unlink()
     with pytest.raises(ValueError, match=r"has --eval-episodes '2', but .* needs '3'"):
         find_finished(replace(cell, n_episodes=3), cell.run_folder(tmp_path))
     with pytest.raises(ValueError, match=r"has --eval-freq '480', but .* needs '240'"):

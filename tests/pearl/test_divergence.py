@@ -1,12 +1,14 @@
 """A training that goes wrong says so."""
 
 import warnings
+from functools import partial
 
 import pytest
 import torch as th
 
 from helpers import ROLLOUT, MakePEARL
-from sb3_htr.pearl.divergence import DivergedError, PosteriorWatch
+from sb3_htr.common.warn_once import WarnOnce
+from sb3_htr.pearl.divergence import DivergedError, check_posterior
 
 
 def test_a_diverging_loss_stops_training_with_step_and_tensor(tiny_pearl: MakePEARL) -> None:
@@ -27,17 +29,17 @@ def test_a_weight_that_is_not_finite_is_named(tiny_pearl: MakePEARL, network: st
 
 
 def test_the_posterior_is_watched() -> None:
-    watch = PosteriorWatch()
+    check = partial(check_posterior, warn_once=WarnOnce())
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        watch.check(10.0)
+        check(10.0)
     with pytest.warns(UserWarning, match="collapsed: z says nothing about the task"):
-        watch.check(1e-4)
+        check(1e-4)
     with pytest.warns(UserWarning, match="exploded"):
-        watch.check(1e6)
+        check(1e6)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        watch.check(1e-4)  # once is enough
+        check(1e-4)  # once is enough
 
 
 def test_a_collapsed_posterior_is_warned_of_in_training(tiny_pearl: MakePEARL) -> None:

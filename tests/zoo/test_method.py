@@ -20,7 +20,7 @@ from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run.agents import agent_for
 from sb3_htr.zoo.run.method import PEARLMethod, get_method, merged, methods, register_method
 from sb3_htr.zoo.run.record import RECORD
-from sb3_htr.zoo.run.shipped import hyperparams_file
+from sb3_htr.zoo.run.shipped import block_of, hyperparams_file
 
 OWN = ["htr-ser", "htr-ec", "pearl-dense", "pearl-sparse", "htr-hfr", "htr-hipi"]
 OTHERS = ["rl2", "sac-her"]
@@ -158,6 +158,15 @@ def test_what_is_not_known_is_refused_in_one_sentence(arguments: list[str], mess
     with pytest.raises(ValueError, match=message) as refusal:
         main(["train", "--env", ENV_ID, "-f", str(tmp_path), "-n", "240", "--verbose", "0", *arguments])
     assert "\n" not in str(refusal.value) and not list(tmp_path.rglob("*.zip"))
+
+
+def test_settings_of_an_env_are_those_of_its_block_or_else_of_the_default(tmp_path: Path) -> None:
+    file = tmp_path / "my.yml"
+    blocks = {"default": {"gamma": 0.9}, ENV_ID: {"method": "htr-ec", "gamma": 0.5}}
+    file.write_text(yaml.safe_dump(blocks))
+    assert block_of(str(file), ENV_ID) == {"gamma": 0.5} and block_of(str(file), "SparseAnt-v0") == {"gamma": 0.9}
+    file.write_text(yaml.safe_dump({ENV_ID: blocks[ENV_ID]}))
+    assert block_of(str(file), ENV_ID) == {"gamma": 0.5} and block_of(str(file), "SparseAnt-v0") == {}
 
 
 @pytest.mark.parametrize(("missing", "given"), [("policy", []), ("n_timesteps", []), ("policy", ["-n", "240"])])

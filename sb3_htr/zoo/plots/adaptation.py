@@ -109,7 +109,7 @@ def plot_adaptation_paths(
         plt.Line2D([], [], color=GREEN, marker="o", linestyle="", alpha=0.5, markersize=9, label="hidden goal"),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
-    figure.suptitle(title, fontsize=11)
+    figure.suptitle(title if len(order) == len(tasks) else f"{title}; {len(order)} of them", fontsize=11)
     for axes in grid[-1]:
         axes.set_xlabel("x (units of length)")
     for axes in grid[:, 0]:

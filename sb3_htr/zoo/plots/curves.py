@@ -1,7 +1,7 @@
 """Curves over several runs: interquartile mean and interval."""
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -10,13 +10,16 @@ from matplotlib.figure import Figure
 from sb3_htr.zoo.plots.intervals import iqm_interval
 from sb3_htr.zoo.plots.style import COLOURS, curve_styles, save, span_unit_if_flat
 
-# With more points than these, a curve has no markers
-MAX_MARKERS = 20
+# On a curve of more points, on some of them
+N_MARKERS = 12
 # Hollow and each of another shape, so that of curves that coincide, as where nothing is solved, all are seen
 MARKERS = dict(zip(COLOURS, "oXD^vxsph*", strict=True))
 
+# What is shown of so few seeds: of three the IQM is the mean, and of two its bootstrap interval their range
+OF_FEW = {2: "mean and range of 2 seeds", 3: "mean of 3 seeds, 95 % interval"}
 
-def band(axes: plt.Axes, x: np.ndarray, scores: np.ndarray, colour: str, style: str, label: str) -> None:
+
+def band(axes: plt.Axes, x: np.ndarray, scores: np.ndarray, colour: str, style: str, label: str, alpha: float = 0.2) -> None:
     """
     Draw the IQM over runs at each x, with its interval.
 
@@ -26,11 +29,12 @@ def band(axes: plt.Axes, x: np.ndarray, scores: np.ndarray, colour: str, style: 
     :param colour: of line and band, one of :data:`~sb3_htr.zoo.plots.style.COLOURS`
     :param style: of the line, matplotlib's
     :param label: for the legend
+    :param alpha: of the interval: less where many lie above each other
     """
     points = np.array([iqm_interval(scores[..., i]) for i in range(len(x))])
-    marker = MARKERS[colour] if len(x) <= MAX_MARKERS else ""
-    axes.plot(x, points[:, 0], style, color=colour, label=label, marker=marker, markersize=5, markerfacecolor="none")
-    axes.fill_between(x, points[:, 1], points[:, 2], color=colour, alpha=0.2, linewidth=0)
+    (line,) = axes.plot(x, points[:, 0], style, color=colour, label=label, markersize=5, markerfacecolor="none")
+    line.set(marker=MARKERS[colour], markevery=-(-len(x) // N_MARKERS))
+    axes.fill_between(x, points[:, 1], points[:, 2], color=colour, alpha=alpha, linewidth=0)
 
 
 def finish(figure: Figure, path: Path, title: str, legend_columns: int = 2) -> None:
@@ -44,7 +48,9 @@ def finish(figure: Figure, path: Path, title: str, legend_columns: int = 2) -> N
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.25)
         if axes.get_legend_handles_labels()[0]:
-            axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=legend_columns)
+            below: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.17)}
+            # Handles so long that dashes are seen beside the marker
+            axes.legend(ncols=legend_columns, frameon=False, fontsize=8, handlelength=4, **below)
     figure.suptitle(title, fontsize=11)
     save(figure, path)
 
@@ -88,7 +94,6 @@ def plot_curves(curves: dict[str, Curve], path: Path, title: str, x_label: str, 
         axes.set_xlabel(x_label)
         axes.xaxis.get_major_locator().set_params(integer=True)
     span_unit_if_flat(left)
-    # Of three seeds and fewer, the IQM is the mean, and of two its bootstrap interval their range
     seeds = {min(len(curve.returns), 4) for curve in curves.values()}
-    shown = {4: "IQM over seeds, 95 % interval", 3: "mean of 3 seeds, 95 % interval", 2: "mean and range of 2 seeds"}
+    shown = {4: "IQM over seeds, 95 % interval", **dict(sorted(OF_FEW.items(), reverse=True))}
     finish(figure, path, "; ".join([title, *(text for n, text in shown.items() if n in seeds)]))

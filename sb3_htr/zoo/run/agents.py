@@ -20,6 +20,7 @@ import htr_envs  # noqa: F401 registers the envs
 from sb3_htr.common.checkpoint import checkpoints, n_steps_done
 from sb3_htr.common.checks import check_device
 from sb3_htr.common.errors import last_line
+from sb3_htr.common.settings import name_of
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.zoo.run.algorithm import Algorithm, Model
 from sb3_htr.zoo.run.folder import run_number
@@ -76,8 +77,7 @@ class TrainedAgent:
     @property
     def explorer(self) -> str:
         """Name of the explorer that it was evaluated with in its training."""
-        explorer = self.record.get("hyperparams", {}).get("explorer", OWN)
-        return str(explorer["name"] if isinstance(explorer, dict) else explorer)
+        return str(name_of(self.record.get("hyperparams", {}).get("explorer", OWN)))
 
     def load(self, device: str = "cpu") -> Model:
         """

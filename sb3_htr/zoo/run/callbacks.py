@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +10,15 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import CSVOutputFormat, TensorBoardOutputFormat
 
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
-from sb3_htr.common.errors import reason
+from sb3_htr.common.errors import training_goes_on
 
 
 class PatientCSV(CSVOutputFormat):
     """Writes as long as that is possible: a disk that is full stops no training."""
 
     def write(self, *args: Any, **kwargs: Any) -> None:
-        try:
+        with training_goes_on(self.file.name):
             super().write(*args, **kwargs)
-        except OSError as error:
-            warnings.warn(f"{self.file.name} could not be written ({reason(error)}). Training goes on.")
 
     def close(self) -> None:
         with contextlib.suppress(OSError):  # what could not be written before
@@ -39,13 +36,11 @@ class PatientTensorBoard(TensorBoardOutputFormat):
         self.writer, self._is_closed = output.writer, False
 
     def write(self, *args: Any, **kwargs: Any) -> None:
-        try:
-            super().write(*args, **kwargs)
-        except OSError as error:
-            folder = self.writer.log_dir
-            warnings.warn(f"TensorBoard's {folder} could not be written ({reason(error)}). Training goes on.")
-            with contextlib.suppress(OSError):
-                self.writer = type(self.writer)(log_dir=folder)
+        folder = self.writer.log_dir
+        with training_goes_on(f"TensorBoard's {folder}"):
+            return super().write(*args, **kwargs)
+        with contextlib.suppress(OSError):
+            self.writer = type(self.writer)(log_dir=folder)
 
     def close(self) -> None:
         with contextlib.suppress(OSError):

@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 from sb3_htr.adaptation.explorers import EXPLORERS
-from sb3_htr.common.settings import check_numbers, keywords_of
+from sb3_htr.common.settings import check_numbers, keywords_of, name_of
 from sb3_htr.htr.relabel import RELABELLERS, TrainingTaskRelabelling
 from sb3_htr.rivals.adaptation import OwnWay
 from sb3_htr.zoo.run.algorithm import ALGORITHMS, Algorithm, check_folder_name
@@ -123,8 +123,7 @@ class PEARLMethod(Method):
         buffer = of_env.get("replay_buffer_kwargs", {})
         found = []
         for name in ("explorer", "train_explorer", "relabeller", "relabel_probability", "rl_reward_type"):
-            theirs = {**of_env, **buffer}.get(name)
-            value = theirs.get("name") if isinstance(theirs, Mapping) else theirs
+            value = name_of({**of_env, **buffer}.get(name))
             if value not in (None, getattr(self, name)):
                 found.append(f"{name} {value!r}")
         return found

@@ -14,7 +14,7 @@ from sb3_htr.common.markdown import markdown_table
 from sb3_htr.zoo.run.algorithm import Algorithm
 from sb3_htr.zoo.run.hub import model_name
 from sb3_htr.zoo.run.method import DEFAULT, PEARLMethod, get_method, merged, methods
-from sb3_htr.zoo.run.shipped import hyperparams_file
+from sb3_htr.zoo.run.shipped import block_of, hyperparams_file
 from sb3_htr.zoo.run.train_arguments import given_arguments, value_of
 from sb3_htr.zoo.run.trust import CONF, PACKAGES, WEIGHTS
 
@@ -84,9 +84,7 @@ def _params(record: dict[str, Any], words: list[str]) -> list[str] | None:
     method, had = methods().get(record["method"]), record.get("hyperparams", {})
     if method is None:
         return None
-    blocks = yaml.safe_load(hyperparams_file(value_of(words, *CONF) or method.algorithm.settings).read_text())
-    of_env = {key: value for key, value in blocks.get(record["env_id"], blocks.get("default", {})).items() if key != "method"}
-    of_words = method.settings(of_env)
+    of_words = method.settings(block_of(value_of(words, *CONF) or method.algorithm.settings, record["env_id"]))
     if value_of(words, "-n", "--n-timesteps") is not None:
         of_words["n_timesteps"] = had.get("n_timesteps")
     params = {key: value for key, value in had.items() if key not in of_words or of_words[key] != value}

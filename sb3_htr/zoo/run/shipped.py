@@ -2,6 +2,9 @@
 
 import difflib
 from pathlib import Path
+from typing import Any
+
+import yaml
 
 PACKAGE = Path(__file__).parents[2]
 
@@ -21,6 +24,17 @@ def hyperparams_file(name: str) -> Path:
     :return: its path
     """
     return shipped("hyperparams") / name
+
+
+def block_of(file: str, env_id: str) -> dict[str, Any]:
+    """
+    :param file: name of a YAML file of the package, or path of another
+    :param env_id: registered env
+    :return: hyperparameters that it has for the env, of its own block or the default one, but for the method
+    """
+    blocks = yaml.safe_load(hyperparams_file(file).read_text())
+    block = blocks.get(env_id, blocks.get("default", {}))
+    return {key: value for key, value in block.items() if key != "method"}
 
 
 def find_hyperparams(name: str) -> str:
