@@ -51,7 +51,7 @@ class AntDirectionEnv(MetaEnv):
         super().__init__(Directions(**family_kwargs))
         self.render_mode = render_mode
         if render_mode is not None:
-            open_no_window()
+            open_no_window(render_mode)
         self.ant = AntEnv(render_mode=render_mode, include_cfrc_ext_in_observation=False)
         self.observation_space = self.ant.observation_space
         self.action_space = self.ant.action_space
@@ -67,7 +67,7 @@ class AntDirectionEnv(MetaEnv):
 
     def render(self) -> Any:
         """Picture (480, 480, 3), uint8; None without a render mode."""
-        return self.ant.render()
+        return self.ant.render() if self.render_mode else None
 
     def close(self) -> None:
         """Release what draws the pictures."""

@@ -50,7 +50,7 @@ class HalfCheetahVelocityEnv(MetaEnv):
         super().__init__(SpeedDistribution(**family_kwargs))
         self.render_mode = render_mode
         if render_mode is not None:
-            open_no_window()
+            open_no_window(render_mode)
         self.cheetah = HalfCheetahEnv(render_mode=render_mode, ctrl_cost_weight=0.05)
         self.observation_space = self.cheetah.observation_space
         self.action_space = self.cheetah.action_space
@@ -65,7 +65,7 @@ class HalfCheetahVelocityEnv(MetaEnv):
 
     def render(self) -> Any:
         """Picture (480, 480, 3), uint8; None without a render mode."""
-        return self.cheetah.render()
+        return self.cheetah.render() if self.render_mode else None
 
     def close(self) -> None:
         """Release what draws the pictures."""

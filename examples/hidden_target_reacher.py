@@ -75,7 +75,7 @@ class HiddenTargetReacherEnv(TaskEnv):
         super().__init__(HiddenTargetFamily(**family_kwargs), reward_type)
         self.render_mode = render_mode
         if render_mode is not None:
-            open_no_window()
+            open_no_window(render_mode)
         self.reacher = ReacherEnv(render_mode=render_mode)
         self.observation_space = spaces.Box(-np.inf, np.inf, (8,), np.float32)
         self.action_space = spaces.Box(-1, 1, (2,), np.float32)
@@ -99,7 +99,7 @@ class HiddenTargetReacherEnv(TaskEnv):
 
     def render(self) -> Any:
         """Picture (480, 480, 3), uint8, with the target of the episode; None without a render mode."""
-        return self.reacher.render()
+        return self.reacher.render() if self.render_mode else None
 
     def close(self) -> None:
         """Release what draws the pictures."""

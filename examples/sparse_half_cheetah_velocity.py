@@ -75,7 +75,7 @@ class SparseHalfCheetahVelocityEnv(TaskEnv):
         super().__init__(SpeedFamily(**family_kwargs), reward_type)
         self.render_mode = render_mode
         if render_mode is not None:
-            open_no_window()
+            open_no_window(render_mode)
         self.cheetah = HalfCheetahEnv(render_mode=render_mode, ctrl_cost_weight=0.05)
         self.observation_space = spaces.Box(-np.inf, np.inf, (18,), np.float32)
         self.action_space = spaces.Box(-1, 1, (6,), np.float32)
@@ -91,7 +91,7 @@ class SparseHalfCheetahVelocityEnv(TaskEnv):
 
     def render(self) -> Any:
         """Picture (480, 480, 3), uint8; None without a render mode."""
-        return self.cheetah.render()
+        return self.cheetah.render() if self.render_mode else None
 
     def close(self) -> None:
         """Release what draws the pictures."""

@@ -52,7 +52,7 @@ class WalkerRandomParamsEnv(MetaEnv):
 
     def __init__(self, render_mode: str | None = None, **family_kwargs: Any) -> None:
         if render_mode is not None:
-            open_no_window()
+            open_no_window(render_mode)
         self.walker = Walker2dEnv(render_mode=render_mode)
         self.original = {name: getattr(self.walker.model, name).copy() for name in PARAMETERS}
         super().__init__(ScaleDistribution(sum(values.size for values in self.original.values()), **family_kwargs))
@@ -76,7 +76,7 @@ class WalkerRandomParamsEnv(MetaEnv):
 
     def render(self) -> Any:
         """Picture (480, 480, 3), uint8; None without a render mode."""
-        return self.walker.render()
+        return self.walker.render() if self.render_mode else None
 
     def close(self) -> None:
         """Release what draws the pictures."""

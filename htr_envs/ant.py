@@ -9,7 +9,13 @@ import gymnasium
 import numpy as np
 
 from htr_envs.dynamics import DynamicsEnv
-from htr_envs.mujoco_dynamics import DoubleArray, MujocoDynamics, MujocoVectorEnv, mujoco  # says so where MuJoCo is missing
+from htr_envs.mujoco_dynamics import (  # says so where MuJoCo is missing
+    DoubleArray,
+    MujocoDynamics,
+    MujocoVectorEnv,
+    finite_float,
+    mujoco,
+)
 from htr_envs.semicircle_goals import LOCOMOTION_ARENA, AntGoalFamily
 from htr_envs.task_env import BoolArray, FloatArray
 
@@ -69,9 +75,9 @@ class AntDynamics(MujocoDynamics):
     ) -> None:
         bounds = [*[LOCOMOTION_ARENA] * 2, 10.0, *[1.0] * 4, *[np.pi] * 8, *[100.0] * 14]
         super().__init__(num_envs, n_threads, _low_gear_ant(), reset_noise_scale, np.array(bounds, dtype=np.float32))
-        self.ctrl_cost_weight = np.float32(ctrl_cost_weight)
-        self.contact_cost_weight = np.float32(contact_cost_weight)
-        self.healthy_reward = np.float32(healthy_reward)
+        self.ctrl_cost_weight = finite_float("ctrl_cost_weight", ctrl_cost_weight)
+        self.contact_cost_weight = finite_float("contact_cost_weight", contact_cost_weight)
+        self.healthy_reward = finite_float("healthy_reward", healthy_reward)
 
     def _start_position(self) -> DoubleArray:
         return np.array(self.model.qpos0)

@@ -36,6 +36,8 @@ class Episode(NamedTuple):
     successes: BoolArray
     achieved_tasks: FloatArray
     terminated: BoolArray
+    truncated: BoolArray
+    infos: NDArray[np.object_]
     task_id: int
 
 
@@ -142,13 +144,13 @@ def _play(
     env: gym.Env[Any, Any],
     family: TaskFamily,
     seed: int,
-    task: FloatArray | None = None,
+    task: FloatArray | int | None = None,
     actions: FloatArray | None = None,
     after_step: Callable[[], object] = lambda: None,
 ) -> Episode:
     action_space = copy.deepcopy(env.action_space)
     action_space.seed(seed)
-    options = None if task is None else {"task": task}
+    options = None if task is None else {"task_id" if isinstance(task, int) else "task": task}
     observation, info = _call("The env fails in a reset.", lambda: env.reset(seed=seed, options=options))
     _check_observation(env, observation, "a reset")
     _require(type(info.get("task_id")) is int, "The info of reset lacks `task_id`, or it is no int.")
@@ -161,14 +163,16 @@ def _play(
         _check_step(env, family, next_observation, reward, info)
         _require(info["task_id"] == task_id, f"The task changed within an episode, from {task_id} to {info['task_id']}.")
         free, success, achieved_task = (info.get(key) for key in ("task_free_reward", "is_success", "achieved_task"))
-        fresh = not rows or achieved_task is None or not np.shares_memory(achieved_task, rows[-1][-2])
+        fresh = not rows or achieved_task is None or not np.shares_memory(achieved_task, rows[-1][6])
         _require(fresh, "info['achieved_task'] is the same memory at each step: return a copy.")
-        rows.append((observation, action, next_observation, free, reward, success, achieved_task, terminated))
+        step = observation, action, next_observation, free, reward, success, achieved_task
+        rows.append((*step, terminated, truncated, info))
         observation, done = next_observation, terminated or truncated
         after_step()
     columns = [np.array(column) for column in zip(*rows, strict=True)]
     traj = Trajectory(*(column.astype(np.float32) for column in columns[:4]))
-    return Episode(traj, columns[4].astype(np.float32), columns[5], columns[6], columns[7], task_id)
+    successes, achieved_tasks, ends, cuts, infos = columns[5:]
+    return Episode(traj, columns[4].astype(np.float32), successes, achieved_tasks, ends, cuts, infos, task_id)
 
 
 def _check_rewards(env: gym.Env[Any, Any], family: TaskFamily, episode: Episode, task: FloatArray) -> None:
@@ -412,13 +416,14 @@ def _check_id(env: gym.Env[Any, Any], family: TaskFamily, seed: int) -> None:
     assert spec is not None
     spec.additional_wrappers = ()  # they change nothing that is looked at here
     spec.kwargs.pop("render_mode", None)  # nobody looks on, and batches have none
-    twins: list[Any] = [_call("The env cannot be made a second time by its id.", gym.make, spec).unwrapped]
+    twin = _call("The env cannot be made a second time by its id.", gym.make, spec)
+    twins: list[Any] = [twin.unwrapped]
     if spec.vector_entry_point is not None:
         mode = gym.VectorizeMode.VECTOR_ENTRY_POINT
         for n in (1, 2):
             make = partial(gym.make_vec, spec, n, vectorization_mode=mode)
             twins.append(_call("The batch of the id cannot be made.", make))
-            _check_batch(twins[-1], env, family, seed)
+            _check_batch(twins[-1], twin, family, seed)
     for twin in twins:
         for name in TASK_SETS:
             told = f"Another env of the same id has other {name}: draw them with a generator whose seed is an argument."
@@ -428,25 +433,41 @@ def _check_id(env: gym.Env[Any, Any], family: TaskFamily, seed: int) -> None:
 
 def _check_batch(batch: Any, env: gym.Env[Any, Any], family: TaskFamily, seed: int) -> None:
     """The first of its envs against a single one; what others beside it do makes no difference."""
-    episode = _play(env, family, seed, family.train_tasks[0])
+    for name in ("observation_space", "action_space"):
+        own, expected = getattr(batch, f"single_{name}"), getattr(env, name)
+        _require(own == expected, f"The batch of the id has another single_{name}, {own}, than the env itself, {expected}.")
+    episode = _play(env, family, seed, 0)
     options = {"task_id": np.zeros(batch.num_envs, dtype=np.int64)}
     others = [env.action_space.high] * (batch.num_envs - 1)  # type: ignore[attr-defined]
-    observations, _ = _call("The batch of the id fails in a reset.", lambda: batch.reset(seed=seed, options=options))
+
+    def start(seed: int) -> Any:
+        return _call("The batch of the id fails in a reset.", lambda: batch.reset(seed=seed, options=options))[0]
+
+    observations = np.array(start(seed))
     finite = bool(np.isfinite(observations).all())
     _require(finite, "The batch of the id begins with an observation that is not finite: see its _reset_state.")
     if not _same(observations[0], episode.traj.observations[0]):
+        drawn = not _same(observations[0], start(seed + 1)[0])
+        _require(
+            drawn, "The batch of the id begins elsewhere than the env itself, and not by chance: each seed has this start."
+        )
         return  # starts that are drawn in another way: nothing can be compared
-    for action, expected, reward in zip(episode.traj.actions, episode.traj.next_observations, episode.rewards, strict=True):
+    columns = episode.traj.next_observations, episode.rewards, episode.terminated, episode.truncated
+    for step, (action, info, *values) in enumerate(zip(episode.traj.actions, episode.infos, *columns, strict=True), start=1):
         before = batch.np_random.bit_generator.state
         actions = np.stack([action, *others])
-        _, told, terminated, truncated, infos = _call("The batch of the id fails in a step.", batch.step, actions)
-        ended = terminated | truncated
-        if others and not ended.any() and batch.np_random.bit_generator.state != before:
+        _, rewards, terminated, truncated, infos = _call("The batch of the id fails in a step.", batch.step, actions)
+        if others and not (terminated | truncated).any() and batch.np_random.bit_generator.state != before:
             return  # noise that is drawn for several: nothing can be compared
-        same = _same(infos["final_obs"][0], expected) and _same(told[0], reward)
-        _require(same, "The batch of the id gives another episode than the env itself, from the same start.")
-        if ended[0]:
-            return
+        told = {**infos, "reward": rewards, "terminated": terminated, "truncated": truncated}
+        named = zip(("final_obs", "reward", "terminated", "truncated"), values, strict=True)
+        for name, value in (*named, *((key, info[key]) for key in INFO_KINDS if key in info)):
+            own = told[name][0] if name in told else "missing"
+            _require(
+                name in told and _same(own, value),
+                "The batch of the id gives another episode than the env itself, from the same start: "
+                f"{name} of step {step} is {own} in place of {value}.",
+            )
 
 
 def check_task_env(env: gym.Env[Any, Any], n_episodes: int = 3, seed: int = 0) -> None:

@@ -132,6 +132,17 @@ class DynamicsEnv(TaskEnv):
         self.dynamics.close()
 
 
+def refuse_pictures(kwargs: dict[str, Any]) -> None:
+    """Refuse the render mode that only a single env has.
+
+    :param kwargs: arguments of a batch, of which it is taken away.
+    :raises ValueError: if it is not None.
+    """
+    render_mode = kwargs.pop("render_mode", None)
+    if render_mode is not None:
+        raise ValueError(f"A batch draws no pictures: make a single env for render_mode={render_mode!r}.")
+
+
 class DynamicsVectorEnv(TaskVectorEnv):
     """Many robots with tasks that step together.
 

@@ -22,6 +22,7 @@ from htr_envs.goal_env_source import (
 )
 from htr_envs.headless import open_no_window
 from htr_envs.task_env import BoolArray, FloatArray, TaskEnv, TaskFamily, Trajectory, at_step, check_reward_type, l2_distance
+from htr_envs.task_sets import check_task_sets
 
 NAMESPACE = "HiddenGoal"
 NOT_BEGUN = -1
@@ -39,7 +40,7 @@ class HiddenGoalFamily(TaskFamily):
     :param n_test_tasks: how many test tasks.
     :param n_validation_tasks: how many validation tasks.
     :param task_seed: seed of the task sets.
-    :raises ValueError: if the env is no GoalEnv, its reward is not sparse, or it has too few goals.
+    :raises ValueError: if the env is no GoalEnv, its reward is not sparse, it has too few goals, or a number is out of range.
     :raises gymnasium.error.Error: if there is no such env, or it cannot be made with what is installed.
     """
 
@@ -53,6 +54,7 @@ class HiddenGoalFamily(TaskFamily):
         task_seed: int = 1337,
     ) -> None:
         self.source = GoalEnvSource.find(env_id, env_kwargs or {})
+        check_task_sets(n_train_tasks, n_validation_tasks, n_test_tasks, task_seed)
         goals = draw_goal_sets(self.source, n_train_tasks, n_validation_tasks, n_test_tasks, task_seed)
         self.failure_reward = goals.failure_reward
         # whatever bounds the env has: where an object falls, its position is a hindsight task too
@@ -186,9 +188,12 @@ class HiddenGoalEnv(TaskEnv):
         env = probe(self.task_family.source)
         assert isinstance(env.action_space, spaces.Box)
         self.observation_space = space_without_goal(env)
-        low, high = (bound.astype(np.float32) for bound in (env.action_space.low, env.action_space.high))
+        self._bounds = env.action_space.low, env.action_space.high
+        low, high = (bound.astype(np.float32) for bound in self._bounds)
         self.action_space = spaces.Box(low, high, dtype=np.float32)
         modes = [mode for mode in self.metadata["render_modes"] if mode in env.metadata.get("render_modes", ())]
+        if render_mode not in (None, *modes):
+            raise ValueError(f"render_mode is {render_mode!r}, expected None or one of {modes}.")
         shown = {"render_modes": modes, "render_fps": env.metadata.get("render_fps", 25)}
         self.metadata = {**self.metadata, **shown}  # type: ignore[misc]
         self.render_mode = render_mode
@@ -215,7 +220,8 @@ class HiddenGoalEnv(TaskEnv):
         if self._env is None:
             self._env = self.task_family.source.make()
             self._follow(self._env, NOT_BEGUN)
-        self._actions.append(np.clip(action, self.action_space.low, self.action_space.high))
+        # by bounds of the GoalEnv's own dtype: those of our space, rounded to float32, may lie outside of them
+        self._actions.append(np.clip(action, *self._bounds))
         observation, _, terminated, self._truncated, _ = self._env.step(self._actions[-1].copy())
         own_end = terminated and self.task_family.reached(observation["achieved_goal"], observation["desired_goal"])
         return without_goal(observation), 0.0, bool(terminated and not own_end)

@@ -237,11 +237,6 @@ def draw_goal_sets(source: GoalEnvSource, n_train: int, n_validation: int, n_tes
     :return: the goals; must not be written to.
     :raises ValueError: if the env has too few goals, draws others for the same seed, or its reward is not sparse.
     """
-    if min(n_train, n_validation, n_test) < 1:
-        raise ValueError(
-            f"n_train_tasks, n_validation_tasks, n_test_tasks are {n_train}, {n_validation}, {n_test}: each must be at least "
-            "1."
-        )
     first, _, again = (draw_goal(source, seed) for seed in (0, 1, 0))
     if not np.array_equal(first, again):
         raise ValueError(

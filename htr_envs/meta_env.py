@@ -120,7 +120,7 @@ class TaskDistribution(ABC):
         """
         indices = np.asarray(ids)
         n = len(self.train_tasks)
-        if not np.issubdtype(indices.dtype, np.integer):
+        if indices.size and not np.issubdtype(indices.dtype, np.integer):
             raise ValueError(f"The task id {ids!r} is no integer: pass an index into train_tasks, from 0 to {n - 1}.")
         if indices.shape != shape:
             raise ValueError(f"The task id has shape {indices.shape}, expected {shape}: pass one id for each env.")
@@ -149,11 +149,15 @@ def task_from_options(options: dict[str, Any] | None) -> tuple[str, Any] | None:
 def checked_action(action: ArrayLike, space: spaces.Space[Any]) -> NDArray[np.float32]:
     """A float32 copy of an action, or of one for each env.
 
-    :raises ValueError: if it has another shape than those of the space, or a number that is not finite.
+    :raises ValueError: if it is not made of numbers, has another shape than those of the space, or a number that is not
+        finite.
     """
-    checked = np.array(action, dtype=np.float32)
+    try:
+        checked = np.array(action, dtype=np.float32)
+    except (TypeError, ValueError):
+        raise ValueError(f"The action is {action!r}, expected numbers of shape {space.shape}: pass a float array.") from None
     if checked.shape != space.shape:
-        raise ValueError(f"The action has shape {checked.shape}, expected {space.shape}: pass one action for each env.")
+        raise ValueError(f"The action has shape {checked.shape}, expected {space.shape}: pass one of the action space.")
     if not np.isfinite(checked).all():
         raise ValueError(f"The action is {checked}, expected finite numbers: look for where it comes from.")
     return checked
@@ -255,9 +259,9 @@ class MetaEnv(HasTaskFamily, gym.Env[FloatArray, FloatArray], ABC):
         :raises ValueError: if an option is unknown or its task is invalid.
         """
         chosen = task_from_options(options)
-        super().reset(seed=seed)
         if chosen is not None:
             self._give(*chosen)
+        super().reset(seed=seed)  # not before: a reset that is refused changes nothing
         # drawn even if it is not used: a seed then gives the same starts whichever way the task was chosen
         drawn = int(self.np_random.integers(len(self.train_tasks)))
         self._current = (drawn, self.train_tasks[drawn]) if self._given is None else self._given
@@ -284,6 +288,13 @@ class MetaEnv(HasTaskFamily, gym.Env[FloatArray, FloatArray], ABC):
         """
         _, observation, reward, terminated = self._checked_step(action)
         return observation, float(reward), bool(terminated), False, {"task_id": self.task_id}
+
+    def render(self) -> Any:
+        """Draw the env, which is for a subclass to write.
+
+        :return: a picture; None without a render mode.
+        """
+        return None if self.render_mode is None else super().render()
 
     def _checked_step(self, action: FloatArray) -> tuple[FloatArray, FloatArray, float, bool]:
         """Check the action and move the dynamics.

@@ -93,11 +93,13 @@ class MetaWorldGoalEnv(gym.Env[dict[str, DoubleArray], NDArray[np.float32]]):
         distance = np.linalg.norm(achieved_goal - desired_goal, axis=-1)
         return np.asarray(distance <= SUCCESS_DISTANCE, dtype=np.float64)
 
-    def render(self) -> NDArray[np.uint8]:
+    def render(self) -> NDArray[np.uint8] | None:
         """Draw the arm from a corner of its table.
 
-        :return: picture (480, 480, 3), uint8.
+        :return: picture (480, 480, 3), uint8; None without a render mode.
         """
+        if self.render_mode is None:
+            return None
         frame: NDArray[np.uint8] = self._env.render()
         return frame[::-1, ::-1]
 

@@ -17,7 +17,7 @@ from gymnasium import spaces
 from gymnasium.error import DependencyNotInstalled
 from numpy.typing import NDArray
 
-from htr_envs.dynamics import Dynamics, DynamicsVectorEnv
+from htr_envs.dynamics import Dynamics, DynamicsVectorEnv, refuse_pictures
 from htr_envs.headless import open_no_window
 from htr_envs.position_goals import PositionGoalFamily
 from htr_envs.task_env import BoolArray, FloatArray
@@ -74,7 +74,7 @@ class MujocoDynamics(Dynamics[PositionGoalFamily]):
     :param reset_noise_scale: half the width of the uniform noise on the starting positions, and standard deviation of the
         normal noise on the starting velocities.
     :param observation_bounds: observations are clipped at plus and minus these numbers, shape (obs_dim,).
-    :raises ValueError: if the noise is negative or another number smaller than 1.
+    :raises ValueError: if the noise is negative or not finite, or another number smaller than 1.
     """
 
     frame_skip: ClassVar[int]
@@ -94,8 +94,8 @@ class MujocoDynamics(Dynamics[PositionGoalFamily]):
         reset_noise_scale: float,
         observation_bounds: FloatArray,
     ) -> None:
-        if not reset_noise_scale >= 0.0:
-            raise ValueError(f"reset_noise_scale is {reset_noise_scale}, expected a number from 0 on.")
+        if not 0.0 <= reset_noise_scale < np.inf:
+            raise ValueError(f"reset_noise_scale is {reset_noise_scale}, expected a finite number from 0 on.")
         if n_threads is None:
             n_threads = min(available_threads(), max(1, num_envs // self.envs_per_thread))
         if n_threads < 1:
@@ -269,7 +269,22 @@ class MujocoVectorEnv(DynamicsVectorEnv):
         n_threads: int | None = None,
         **kwargs: Any,
     ) -> None:
+        refuse_pictures(kwargs)
         super().__init__(*self.make(num_envs, n_threads, **kwargs), max_episode_steps, reward_type)
+
+
+def finite_float(name: str, value: float) -> np.float32:
+    """A number of float32, such as the weight of a cost.
+
+    :param name: of it.
+    :param value: the number.
+    :return: the same.
+    :raises ValueError: if it is not finite.
+    """
+    number = np.float32(value)
+    if not np.isfinite(number):
+        raise ValueError(f"{name} is {value}, expected a finite number.")
+    return number
 
 
 def _add_discs(spec: mujoco.MjSpec) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from htr_envs.dynamics import Dynamics, DynamicsEnv, DynamicsVectorEnv
+from htr_envs.dynamics import Dynamics, DynamicsEnv, DynamicsVectorEnv, refuse_pictures
 from htr_envs.semicircle_goals import SemicircleGoalFamily
 from htr_envs.task_env import BoolArray, FloatArray
 
@@ -173,4 +173,5 @@ class PointRobotVectorEnv(DynamicsVectorEnv):
     def __init__(
         self, num_envs: int = 1, max_episode_steps: int | None = 20, reward_type: str = "sparse", **family_kwargs: Any
     ) -> None:
+        refuse_pictures(family_kwargs)
         super().__init__(PointRobotFamily(**family_kwargs), PointRobotDynamics(num_envs), max_episode_steps, reward_type)

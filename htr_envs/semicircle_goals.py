@@ -14,6 +14,17 @@ from htr_envs.task_sets import draw_task_sets
 LOCOMOTION_ARENA = 20.0  # a robot gets up to 10 in 200 steps
 
 
+def _part(held_out: tuple[float, float]) -> tuple[float, float]:
+    try:
+        low, high = held_out
+        fits = 0.0 <= low < high <= 180.0 and (low, high) != (0.0, 180.0)
+    except (TypeError, ValueError):
+        fits = False
+    if not fits:
+        raise ValueError(f"held_out is {held_out!r}, expected degrees (from, to), 0 <= from < to <= 180, but not all of them.")
+    return low / 180.0, high / 180.0
+
+
 class SemicircleGoalFamily(PositionGoalFamily):
     """Goals (x, y) at one distance from the start, at angles from 0 to pi.
 
@@ -46,7 +57,7 @@ class SemicircleGoalFamily(PositionGoalFamily):
         if not 0.0 < goal_distance <= arena:
             raise ValueError(f"goal_distance is {goal_distance}, expected a number above 0 and up to {arena}.")
         self.goal_distance = float(goal_distance)
-        sector = None if held_out is None else (held_out[0] / 180.0, held_out[1] / 180.0)
+        sector = None if held_out is None else _part(held_out)
         drawn = draw_task_sets(n_train_tasks, n_validation_tasks, n_test_tasks, task_seed, sector)
         train, validation, test = (self._goals(np.pi * values) for values in drawn)
         super().__init__(arena, goal_radius, train, validation, test)

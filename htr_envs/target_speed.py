@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from htr_envs.dynamics import Dynamics, DynamicsEnv, DynamicsVectorEnv
+from htr_envs.dynamics import Dynamics, DynamicsEnv, DynamicsVectorEnv, refuse_pictures
 from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, at_step, check_reward_type, l2_distance
 from htr_envs.task_sets import draw_task_sets
 
@@ -234,4 +234,5 @@ class TargetSpeedVectorEnv(DynamicsVectorEnv):
     def __init__(
         self, num_envs: int = 1, max_episode_steps: int | None = 40, reward_type: str = "sparse", **family_kwargs: Any
     ) -> None:
+        refuse_pictures(family_kwargs)
         super().__init__(TargetSpeedFamily(**family_kwargs), TargetSpeedDynamics(num_envs), max_episode_steps, reward_type)

@@ -70,7 +70,11 @@ def l2_distance(positions: FloatArray, others: FloatArray) -> FloatArray:
     :param positions: shape (..., dim).
     :param others: shape (..., dim); leading axes broadcast.
     :return: shape (...), float32.
+    :raises ValueError: if they have not as many numbers.
     """
+    if others.shape[-1] != positions.shape[-1]:
+        n = positions.shape[-1]
+        raise ValueError(f"Positions of {n} numbers have no distance from others of shape {others.shape}: pass (..., {n}).")
     # column by column, which is three times as fast; not np.linalg.norm: its sum may be ordered by memory layout
     first, *rest = (np.square(positions[..., i] - others[..., i]) for i in range(others.shape[-1]))
     result: FloatArray = np.sqrt(sum(rest, first), dtype=np.float32)
@@ -147,8 +151,14 @@ class HasRewardHooks(HasTaskFamily):
     reward_type: str
 
     def compute_reward(self, traj: Trajectory, task: ArrayLike, reward_type: str | None = None) -> FloatArray:
-        """:meth:`TaskFamily.compute_reward`, by default of the env's own reward type."""
+        """:meth:`TaskFamily.compute_reward`, by default of the env's own reward type.
+
+        :raises ValueError: if the task has not as many numbers as those of the task space, or the reward type is unknown.
+        """
         tasks, of_env = np.asarray(task, dtype=np.float32), self.reward_type
+        expected = self.task_family.train_tasks.shape[1:]
+        if tasks.shape[-1:] != expected:
+            raise ValueError(f"The task has shape {tasks.shape}, expected (..., {expected[0]}): pass tasks of the task space.")
         return self.task_family.compute_reward(traj, tasks, of_env if reward_type is None else reward_type)
 
     def hindsight_task(self, traj: Trajectory, index: ArrayLike) -> FloatArray:

@@ -9,6 +9,25 @@ from numpy.typing import NDArray
 NEAREST, MAX_DRAWS = 1e-6, 100
 
 
+def check_task_sets(n_train_tasks: int, n_validation_tasks: int, n_test_tasks: int, task_seed: int) -> None:
+    """Refuse numbers of which no task sets can be drawn.
+
+    :param n_train_tasks: how many training tasks.
+    :param n_validation_tasks: how many validation tasks.
+    :param n_test_tasks: how many test tasks.
+    :param task_seed: seed of all three.
+    :raises ValueError: if one is no whole number, or out of range.
+    """
+    sizes = n_train_tasks, n_validation_tasks, n_test_tasks
+    if not all(isinstance(n, int | np.integer) and n >= 1 for n in sizes):
+        told = ", ".join(map(repr, sizes))
+        raise ValueError(
+            f"n_train_tasks, n_validation_tasks, n_test_tasks are {told}: each must be a whole number of at least 1."
+        )
+    if not isinstance(task_seed, int | np.integer) or not 0 <= task_seed < 2**32:
+        raise ValueError(f"task_seed is {task_seed!r}, expected a whole number from 0 to {2**32 - 1}.")
+
+
 def draw_task_sets(
     n_train_tasks: int,
     n_validation_tasks: int,
@@ -28,13 +47,9 @@ def draw_task_sets(
     :param task_seed: seed of all three, apart from the seed of a run.
     :param held_out: an interval that training tasks avoid and the others lie in, None for no such split.
     :return: numbers of training, validation and test tasks, one axis each.
-    :raises ValueError: if a number of tasks is smaller than 1, or the interval is none in [0, 1].
+    :raises ValueError: if a number of tasks is smaller than 1, the seed is none, or the interval is none in [0, 1].
     """
-    if min(n_train_tasks, n_test_tasks, n_validation_tasks) < 1:
-        raise ValueError(
-            f"n_train_tasks, n_test_tasks, n_validation_tasks are {n_train_tasks}, {n_test_tasks}, {n_validation_tasks}: "
-            "each must be at least 1."
-        )
+    check_task_sets(n_train_tasks, n_validation_tasks, n_test_tasks, task_seed)
     low, high = (0.0, 1.0) if held_out is None else held_out
     if not 0.0 <= low < high <= 1.0 or held_out == (0.0, 1.0):
         raise ValueError(f"The interval held out of training is {low:g} to {high:g} of the range, expected a part of it.")

@@ -97,16 +97,25 @@ class TaskVectorEnv(HasRewardHooks, VectorEnv[FloatArray, FloatArray, NDArray[An
         :param tasks: indices into ``train_tasks``, shape (n,), or vectors, shape (n, task_dim), one for each copy meant; one
             index for all of them; or None to draw a training task at each reset.
         :param indices: which copies are meant, ints (n,) or a mask (num_envs,); None for all of them.
-        :raises ValueError: if an id is out of range, a vector not in the task space, or their number wrong.
+        :raises ValueError: if an id or an index is out of range, a vector not in the task space, or their number wrong.
         """
         chosen = np.arange(self.num_envs)
         if indices is not None:
-            chosen = np.atleast_1d(chosen[np.asarray(indices)])
+            try:
+                # an empty list is an array of floats
+                chosen = np.atleast_1d(chosen[np.asarray(indices) if np.size(indices) else []])
+            except (IndexError, ValueError):
+                raise ValueError(
+                    f"indices are {indices!r}: pass whole numbers below {self.num_envs}, or a mask of {self.num_envs} bools."
+                ) from None
         if tasks is None:
             self._given[chosen] = False
-        else:
-            values = np.full(len(chosen), tasks) if np.ndim(tasks) == 0 else tasks
-            self._give("task" if np.ndim(values) > 1 else "task_id", values, chosen)
+            return
+        values = np.full(len(chosen), tasks) if np.ndim(tasks) == 0 else tasks
+        if np.ndim(values) == 1 and np.size(values) and np.asarray(values).dtype.kind == "f":
+            shape = (len(chosen), *self._tasks.shape[1:])
+            raise ValueError(f"The tasks {tasks!r} are no whole numbers, as ids are: vectors need the shape {shape}.")
+        self._give("task" if np.ndim(values) > 1 else "task_id", values, chosen)
 
     def _give(self, key: str, value: Any, indices: NDArray[np.int64]) -> None:
         if key == "task_id":
@@ -127,10 +136,11 @@ class TaskVectorEnv(HasRewardHooks, VectorEnv[FloatArray, FloatArray, NDArray[An
         :raises ValueError: if an option is unknown or its tasks are invalid.
         """
         chosen = task_from_options(options)
-        super().reset(seed=seed)
         everyone = np.arange(self.num_envs)
         if chosen is not None:
             self._give(*chosen, everyone)
+        super().reset(seed=seed)  # not before: a reset that is refused changes nothing
+        self.closed = False  # what steps now can be closed again
         assert self.single_observation_space.shape is not None
         self._observations = np.zeros((self.num_envs, *self.single_observation_space.shape), dtype=np.float32)
         self._begin_episodes(self._observations, everyone)
@@ -169,7 +179,8 @@ class TaskVectorEnv(HasRewardHooks, VectorEnv[FloatArray, FloatArray, NDArray[An
                 f"arrays of the shapes {expected}, got {given}."
             )
         states, task_free_reward, terminated = stepped
-        task_free_reward, terminated = np.asarray(task_free_reward), np.asarray(terminated)
+        # float32 as in a single env, before rewards are computed of it
+        task_free_reward, terminated = np.asarray(task_free_reward, dtype=np.float32), np.asarray(terminated)
         if terminated.dtype != np.bool_:
             raise ValueError(
                 f"_step_state returns terminations of dtype {terminated.dtype}, expected bool: observations, task-free "
@@ -191,7 +202,7 @@ class TaskVectorEnv(HasRewardHooks, VectorEnv[FloatArray, FloatArray, NDArray[An
             "task_id": self.task_ids,
             "is_success": successes,
             "achieved_task": achieved,
-            "task_free_reward": np.array(task_free_reward, dtype=np.float32),
+            "task_free_reward": task_free_reward.copy(),
             "final_obs": final_obs,
             "_final_obs": done,
         }

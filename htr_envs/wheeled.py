@@ -8,7 +8,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from htr_envs.dynamics import DynamicsEnv
-from htr_envs.mujoco_dynamics import DoubleArray, MujocoDynamics, MujocoVectorEnv, mujoco  # says so where MuJoCo is missing
+from htr_envs.mujoco_dynamics import (  # says so where MuJoCo is missing
+    DoubleArray,
+    MujocoDynamics,
+    MujocoVectorEnv,
+    finite_float,
+    mujoco,
+)
 from htr_envs.semicircle_goals import LOCOMOTION_ARENA, LocomotionFamily
 from htr_envs.task_env import BoolArray, FloatArray
 
@@ -35,7 +41,7 @@ class WheeledDynamics(MujocoDynamics):
         bounds = [*[LOCOMOTION_ARENA] * 2, 1.0, 1.0, TOP_SPEED, TOP_SPEED, TOP_TURN_RATE, TOP_SPEED, TOP_SPEED]
         spec = mujoco.MjSpec.from_file(str(MODEL))
         super().__init__(num_envs, n_threads, spec, reset_noise_scale, np.array(bounds, dtype=np.float32))
-        self.ctrl_cost_weight = np.float32(ctrl_cost_weight)
+        self.ctrl_cost_weight = finite_float("ctrl_cost_weight", ctrl_cost_weight)
 
     def _start_position(self) -> DoubleArray:
         return np.array([0.0, 0.0, 0.0, np.pi / 2, 0.0, 0.0])
@@ -77,7 +83,7 @@ class WheeledEnv(DynamicsEnv):
     the reward for it is zero until the robot is within the goal's radius. It is the sparse form of the wheeled locomotion
     family of MAESN (Gupta et al., 2018), on which Hindsight Task Relabelling (Packer et al., 2021, appendix A.3) is tested.
 
-    The model is our own: a chassis of 2 kg with a wheel of radius 0.1 m on either side, 0.3 m apart. It slides along x, y and
+    The model is our own: a robot of 2 kg, with a wheel of radius 0.1 m on either side, 0.3 m apart. It slides along x, y and
     z and turns about z, but never tips over. Only the friction of the wheels on the floor moves it, and it slips where the
     motors ask for more. Wheels at full power accelerate it by 13 m/s² up to 5.3 m/s, or turn it by 90° within 0.17 s.
 

@@ -12,6 +12,7 @@ import gymnasium as gym
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from gymnasium.error import DependencyNotInstalled
 
 from helpers import TINY, with_policy
 from htr_envs import check_task_env
@@ -45,6 +46,13 @@ DENSE = {
     "dense_point_robot": "DensePointRobot-v0",
 }
 DEPENDENT = {**DENSE, "walker_random_params": "WalkerRandomParams-v0"}
+OF_GYMNASIUM = (
+    "hidden_target_reacher",
+    "sparse_half_cheetah_velocity",
+    "half_cheetah_velocity",
+    "ant_direction",
+    "walker_random_params",
+)
 
 
 def import_example(module: str) -> None:
@@ -59,6 +67,8 @@ def import_example(module: str) -> None:
 def test_a_family_of_the_examples_is_one(module: str) -> None:
     import_example(module)
     env = gym.make(FAMILIES[module])
+    assert ("render_mode" in inspect.signature(type(env.unwrapped)).parameters) == bool(env.metadata["render_modes"])
+    assert env.unwrapped.render() is None
     check_task_env(env)
     kwargs = {**TINY, "policy_kwargs": with_policy(normalize_observations=True)}
     model = PEARL("MlpPolicy", env, **kwargs, train_explorer="prior").learn(1)
@@ -69,6 +79,7 @@ def test_a_family_of_the_examples_is_one(module: str) -> None:
 def test_an_env_of_the_examples_whose_tasks_change_anything(module: str) -> None:
     import_example(module)
     env = gym.make(DEPENDENT[module])
+    assert env.unwrapped.render() is None
     check_task_env(env, n_episodes=1)
     push = np.full_like(env.action_space.sample(), 0.3)
     steps = []
@@ -84,6 +95,16 @@ def test_an_env_of_the_examples_whose_tasks_change_anything(module: str) -> None
     plain = {"replay_buffer_kwargs": {"relabel_probability": 0.0}, "explorer": prior, "train_explorer": prior}
     model = PEARL("MlpPolicy", env, **{**TINY, **plain, "n_tasks_per_rollout": 1}).learn(1)
     assert model.observation_space.dtype == np.float32 and model.replay_buffer is not None and model.replay_buffer.size() > 0
+
+
+@pytest.mark.parametrize("module", OF_GYMNASIUM)
+def test_a_window_without_a_screen_is_refused(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    importlib.import_module(f"examples.{module}")
+    env_class: Any = type(gym.make({**FAMILIES, **DEPENDENT}[module]).unwrapped)
+    with pytest.raises(DependencyNotInstalled, match="needs a screen, and there is none"):
+        env_class(render_mode="human")
 
 
 def test_successes_of_the_dense_point_robot_are_those_of_the_sparse_one() -> None:

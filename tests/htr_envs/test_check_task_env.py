@@ -10,7 +10,7 @@ from gymnasium.wrappers import TimeLimit
 
 from helpers.broken_envs import BROKEN, LineEnv, LineFamily, NoDenseReward, column
 from helpers.carts import CartEnv
-from htr_envs import DynamicsVectorEnv, PointRobotEnv, PointRobotFamily, PointRobotVectorEnv, check_task_env
+from htr_envs import DynamicsEnv, DynamicsVectorEnv, PointRobotEnv, PointRobotFamily, PointRobotVectorEnv, check_task_env
 from htr_envs.point_robot import PointRobotDynamics
 
 # Annotations here are wide on purpose: most of these classes break the types that they should have.
@@ -123,6 +123,51 @@ class NoisyBatch(DynamicsVectorEnv):
         return super().step(actions)
 
 
+class Elsewhere(PointRobotDynamics):
+    """By starts that are always the same; its actions are scaled."""
+
+    def reset(self, indices: Any, rng: Any) -> Any:
+        self.states[indices] = 0.5
+        return self.states[indices]
+
+    def step(self, actions: Any) -> Any:
+        return super().step(actions / 2)
+
+
+class Wide(PointRobotDynamics):
+    def __init__(self, num_envs: int) -> None:
+        super().__init__(num_envs)
+        self.observation_space = spaces.Box(-99.0, 99.0, (2,), np.float32)
+
+
+class Strong(PointRobotDynamics):
+    def __init__(self, num_envs: int) -> None:
+        super().__init__(num_envs)
+        self.action_space = spaces.Box(-2.0, 2.0, (2,), np.float32)
+
+
+class Ending(PointRobotDynamics):
+    def step(self, actions: Any) -> Any:
+        states, task_free_rewards, _ = super().step(actions)
+        return states, task_free_rewards, np.abs(states).max(axis=-1) > 0.15
+
+
+class Inverted(PointRobotVectorEnv):
+    def step(self, actions: Any) -> Any:
+        *step, infos = super().step(actions)
+        return *step, {**infos, "is_success": ~infos["is_success"]}
+
+
+class Silent(PointRobotVectorEnv):
+    def step(self, actions: Any) -> Any:
+        *step, infos = super().step(actions)
+        return *step, {key: value for key, value in infos.items() if key != "achieved_task"}
+
+
+def batch_of(dynamics: Any) -> Any:
+    return lambda num_envs, max_episode_steps: DynamicsVectorEnv(PointRobotFamily(), dynamics(num_envs), max_episode_steps)
+
+
 class NowhereAtFirst(PointRobotVectorEnv):
     def _reset_state(self, indices: Any) -> Any:
         return super()._reset_state(indices) * np.nan
@@ -131,14 +176,19 @@ class NowhereAtFirst(PointRobotVectorEnv):
 BATCHES: dict[str, tuple[Any, str]] = {
     "nowhere at first": (NowhereAtFirst, "The batch of the id begins with an observation that is not finite"),
     "of its own": (PointRobotVectorEnv, ""),
-    "backwards": (
-        lambda num_envs, max_episode_steps: DynamicsVectorEnv(PointRobotFamily(), Backwards(num_envs), max_episode_steps),
-        "The batch of the id gives another episode than the env itself",
+    "backwards": (batch_of(Backwards), "The batch of the id gives another episode than the env itself"),
+    "mixed up": (batch_of(Entangled), "The batch of the id gives another episode than the env itself"),
+    "elsewhere": (batch_of(Elsewhere), "The batch of the id begins elsewhere than the env itself, and not by chance"),
+    "of other bounds": (batch_of(Wide), "The batch of the id has another single_observation_space, Box(-99.0"),
+    "of other actions": (batch_of(Strong), "The batch of the id has another single_action_space, Box(-2.0"),
+    "that ends": (batch_of(Ending), "is True in place of False"),
+    "cut short": (
+        lambda num_envs, max_episode_steps: PointRobotVectorEnv(num_envs, 3),
+        "truncated of step 3 is True in place",
     ),
-    "mixed up": (
-        lambda num_envs, max_episode_steps: DynamicsVectorEnv(PointRobotFamily(), Entangled(num_envs), max_episode_steps),
-        "The batch of the id gives another episode than the env itself",
-    ),
+    "endless": (lambda num_envs, max_episode_steps: PointRobotVectorEnv(num_envs, None), "truncated of step 20 is False in"),
+    "upside down": (Inverted, "from the same start: is_success of step 1 is True in place of False"),
+    "silent": (Silent, "achieved_task of step 1 is missing in place of"),
     "noisy": (NoisyBatch, ""),
     "with other tasks": (lambda **kwargs: PointRobotVectorEnv(**kwargs, task_seed=1), "Another env of the same id has other"),
     "that cannot be made": (
@@ -156,6 +206,14 @@ def test_the_batch_of_an_id_is_another_of_the_same_envs(batch: Any, sentence: st
         assert_refused(env, sentence)
     else:
         check_task_env(env)
+
+
+def test_a_batch_whose_episodes_do_not_end_where_those_of_the_env_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    single: Any = lambda: DynamicsEnv(PointRobotFamily(), Ending(1))  # noqa: E731
+    monkeypatch.setattr(gym.registry["SparsePointRobot-v0"], "entry_point", single)
+    assert_refused(gym.make("SparsePointRobot-v0"), "is False in place of True")
+    monkeypatch.setattr(gym.registry["SparsePointRobot-v0"], "vector_entry_point", batch_of(Ending))
+    check_task_env(gym.make("SparsePointRobot-v0"))
 
 
 def test_an_id_whose_envs_have_other_tasks_each_time(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -197,7 +197,7 @@ def test_vector_env_follows_gymnasiums_conventions(env_id: str) -> None:
 
 
 class Walkers(Dynamics[LineFamily]):
-    """Walk on a line, pay for the effort, and end beyond 2."""
+    """Walk on a line, pay for the effort, in float64, and end beyond 2."""
 
     def __init__(self, num_envs: int) -> None:
         super().__init__(num_envs, spaces.Box(-5.0, 5.0, (1,), np.float32), spaces.Box(-1.0, 1.0, (1,), np.float32))
@@ -210,7 +210,7 @@ class Walkers(Dynamics[LineFamily]):
     def step(self, actions: Any) -> Any:
         effort = np.clip(actions, -1.0, 1.0)
         self.states = np.clip(self.states + np.float32(0.2) * effort, -5.0, 5.0)
-        return self.states, np.float32(-0.01) * effort[:, 0] ** 2, self.states[:, 0] > 2.0
+        return self.states, -0.01 * effort[:, 0].astype(np.float64) ** 2, self.states[:, 0] > 2.0
 
 
 def test_dynamics_written_once_are_a_single_and_a_batched_env() -> None:
@@ -354,8 +354,10 @@ BAD_OPTIONS = [
 def test_bad_options_are_refused_and_change_nothing(env_id: str, options: dict[str, Any], sentence: str) -> None:
     env, base = make(env_id)
     base.set_task(4)
+    before = base.np_random.bit_generator.state
     with pytest.raises(ValueError, match=sentence):
-        env.reset(options=options)
+        env.reset(seed=7, options=options)
+    assert base.np_random.bit_generator.state == before
     assert env.reset()[1]["task_id"] == 4
 
 
@@ -390,9 +392,44 @@ def test_a_vector_outside_the_task_space_is_refused_and_changes_nothing(env_id: 
 def test_bad_options_of_a_batch_are_refused_and_change_nothing(env_id: str, options: dict[str, Any], sentence: str) -> None:
     vector = make_vec(env_id, 2)
     vector.set_task([4, 5])
+    before = vector.np_random.bit_generator.state
     with pytest.raises(ValueError, match=sentence):
-        vector.reset(options=options)
+        vector.reset(seed=7, options=options)
+    assert vector.np_random.bit_generator.state == before
     assert vector.reset()[1]["task_id"].tolist() == [4, 5]
+
+
+@pytest.mark.parametrize(
+    ("tasks", "indices", "sentence"),
+    [
+        ([1, 2], [0, 7], r"indices are \[0, 7\]: pass whole numbers below 3, or a mask of 3 bools"),
+        ([1, 2], [0.0, 1.0], r"indices are \[0.0, 1.0\]: pass whole numbers"),
+        ([1], [True, False], "or a mask of 3 bools"),
+        (None, [[0], [1, 2]], "pass whole numbers"),
+        ([0.0, 1.0], [0], r"The tasks \[0.0, 1.0\] are no whole numbers, as ids are: vectors need the shape \(1, 2\)"),
+        ([1], [], r"shape \(1,\), expected \(0,\)"),
+    ],
+)
+def test_tasks_for_envs_that_are_none_are_refused(tasks: Any, indices: Any, sentence: str) -> None:
+    vector = make_vec(POINT_ROBOT, 3)
+    vector.set_task([4, 5, 6])
+    with pytest.raises(ValueError, match=sentence):
+        vector.set_task(tasks, indices)
+    nothing: Any
+    for nothing in (None, 3, [], np.zeros((0, 2))):
+        vector.set_task(nothing, [])
+    assert vector.reset()[1]["task_id"].tolist() == [4, 5, 6]
+
+
+@all_envs
+def test_tasks_of_other_spaces_have_no_rewards(env_id: str) -> None:
+    env, base = make(env_id)
+    observation = env.reset()[0][None]
+    traj = Trajectory(observation, observation, observation, np.zeros(1, dtype=np.float32))
+    task = base.train_tasks[0]
+    for other in (task[:-1], np.append(task, task), 0.5):
+        with pytest.raises(ValueError, match=rf"The task has shape .*, expected \(..., {len(task)}\)"):
+            base.compute_reward(traj, other)
 
 
 @all_envs
@@ -415,6 +452,13 @@ def test_wrong_use_is_refused(env_id: str) -> None:
         action[..., -1] = np.nan
         with pytest.raises(ValueError, match=r"nan.*expected finite numbers"):
             step(action)
+    bad: Any
+    for bad in ([[0.0], [0.0, 1.0]], "north", {"left": 1.0}):
+        for early_step, _ in calls:
+            with pytest.raises(ValueError, match=r"^The action is .*, expected numbers of shape"):
+                early_step(bad)
+    with pytest.raises(ValueError, match="A batch draws no pictures: make a single env for render_mode='rgb_array'"):
+        make_vec(env_id, 2, render_mode="rgb_array")
     for build in (lambda: gym.make(env_id, reward_type="shaped"), lambda: make_vec(env_id, 2, reward_type="shaped")):
         with pytest.raises(ValueError, match="reward_type"):
             build()

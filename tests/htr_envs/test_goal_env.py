@@ -145,6 +145,18 @@ class CutEnv(ReachEnv):
         return *others, terminated, self.over, info
 
 
+class ExactEnv(ReachEnv):
+    """Its actions have bounds that float32 rounds to larger ones."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.action_space = spaces.Box(-0.1, 0.1, (2,), np.float64)
+
+    def step(self, action: Any) -> Any:
+        assert action in self.action_space
+        return super().step(action)
+
+
 class PlainEnv(ReachEnv):
     """Not a GoalEnv."""
 
@@ -202,7 +214,7 @@ class Robot(ReachEnv):
 
 BAD = (MovingEnv, CostlyEnv, InformedEnv, UnseededEnv, PlainEnv, DiscreteEnv, OldEnv, UnseededOldEnv, OldStepEnv)
 _class: Any
-for _class in (ReachEnv, ChoiceEnv, ListEnv, CutEnv, *BAD):
+for _class in (ReachEnv, ChoiceEnv, ListEnv, CutEnv, ExactEnv, *BAD):
     gym.register(f"Toy{_class.__name__}-v0", entry_point=_class, max_episode_steps=30)
 TOY, CHOICE = "ToyReachEnv-v0", "ToyChoiceEnv-v0"
 
@@ -448,9 +460,26 @@ def test_a_robot_whose_rewards_are_not_sparse_or_whose_goal_is_none_is_refused()
         HiddenGoalWrapper(gym.make("ToyPlainEnv-v0"))
 
 
-def test_no_tasks_are_refused() -> None:
-    with pytest.raises(ValueError, match="each must be at least 1"):
-        HiddenGoalFamily(TOY, n_test_tasks=0)
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("n_test_tasks", 0), ("n_train_tasks", 80.0), ("task_seed", None), ("task_seed", 1.5), ("task_seed", -1)],
+)
+def test_no_tasks_are_refused(name: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=f"{name}.* (is|are) .* whole number"):
+        HiddenGoalFamily(TOY, **{name: value})
+
+
+def test_a_picture_that_the_goal_env_does_not_draw_is_refused() -> None:
+    for mode in ("human", "rgb_array"):
+        with pytest.raises(ValueError, match=rf"render_mode is '{mode}', expected None or one of \[\]"):
+            HiddenGoalEnv(TOY, render_mode=mode)
+
+
+def test_actions_are_in_the_goal_envs_own_space() -> None:
+    env = HiddenGoalEnv("ToyExactEnv-v0")
+    for action in (env.action_space.low, env.action_space.high, np.ones(2, dtype=np.float32)):
+        env.reset()
+        env.step(action)
 
 
 def test_any_id_is_registered_with_its_time_limit() -> None:
@@ -536,6 +565,11 @@ def test_the_lines_of_the_manual_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
     exec(use, names)
     assert names["env"].spec.id == "HiddenGoal/MyReach-v0"
     assert isinstance(names["model"], PEARL)
+    calls = re.findall(r"`([^`\n]*hide_goal\(\"MyReach[^`\n]*)`", PAGE.read_text())
+    assert len(calls) == 2
+    for call in calls:
+        made = eval(call, {**names, "hide_goal": hide_goal})
+        (gym.make(made) if isinstance(made, str) else made).reset()
 
 
 # ---------------------------------------------------------------- with gymnasium-robotics, panda-gym and Meta-World
@@ -661,6 +695,7 @@ def test_pearl_learns_on_it_and_adapts(env_id: str) -> None:
 @pytest.mark.parametrize("env_id", META_WORLD)
 def test_meta_world_calls_the_same_a_success(env_id: str) -> None:
     env = gym.make(env_id.removeprefix("Hidden"))
+    assert env.unwrapped.render() is None
     n_solved = 0
     for seed in range(3):
         observation, _ = env.reset(seed=seed)

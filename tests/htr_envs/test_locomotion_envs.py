@@ -137,6 +137,10 @@ def test_threads_start_with_the_first_step_and_end_with_close() -> None:
     assert count() == before + 3
     vector.close()
     assert count() == before
+    vector.reset()  # and anew
+    vector.step(vector.action_space.sample())
+    vector.close()
+    assert count() == before
     single_threaded = make_vec(WHEELED, 8, n_threads=1)
     single_threaded.reset()
     single_threaded.step(single_threaded.action_space.sample())
@@ -365,7 +369,12 @@ def test_random_exploration_finds_the_goal_in_at_most_one_episode_of_a_thousand(
 
 @pytest.mark.parametrize(
     "kwargs",
-    [{"goal_radius": 1.5}, {"goal_distance": 30.0}, {"reset_noise_scale": -0.1}, {"reset_noise_scale": float("nan")}],
+    [
+        {"goal_radius": 1.5},
+        {"goal_distance": 30.0},
+        *({"reset_noise_scale": value} for value in (-0.1, np.nan, np.inf)),
+        *({"ctrl_cost_weight": value} for value in (np.nan, np.inf)),
+    ],
 )
 @both_envs
 def test_impossible_arguments_are_refused(env_id: str, kwargs: dict[str, Any]) -> None:
@@ -373,6 +382,13 @@ def test_impossible_arguments_are_refused(env_id: str, kwargs: dict[str, Any]) -
         gym.make(env_id, **kwargs)
     with pytest.raises(ValueError, match=next(iter(kwargs))):
         make_vec(env_id, 2, **kwargs)
+
+
+@pytest.mark.parametrize("name", ["contact_cost_weight", "healthy_reward"])
+def test_an_ant_pays_finite_numbers(name: str) -> None:
+    infinite: dict[str, Any] = {name: np.inf}
+    with pytest.raises(ValueError, match=f"{name} is inf, expected a finite number"):
+        AntEnv(**infinite)
 
 
 def test_impossible_threads_and_render_modes_are_refused() -> None:
