@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL, with_policy
+from helpers.disks import half_written
 from htr_envs import PointRobotFamily
 from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.adaptation import MetaEvalCallback
+from sb3_htr.adaptation.evaluation import AdaptationRecord
 from sb3_htr.common.vec_env import make_task_vec_env
 
 
@@ -28,6 +30,24 @@ def test_meta_eval_logs_keeps_the_best_and_writes_npz(tiny_pearl: MakePEARL, tmp
     returns, _ = evaluate_adaptation(best, env, PointRobotFamily().validation_tasks, n_episodes=3)
     assert returns[:, -1].mean() == callback.best_mean_reward
     assert model.num_timesteps == 3 * ROLLOUT
+
+
+def test_a_worse_model_of_a_training_that_goes_on_is_not_the_best(
+    tiny_pearl: MakePEARL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scores, settings = iter((5.0, 3.0)), dict[str, Any](eval_freq=60, n_eval_episodes=1, verbose=0)
+
+    def scripted(*_: Any, **__: Any) -> AdaptationRecord:
+        return AdaptationRecord(np.full((20, 1), next(scores)), np.zeros((20, 1), bool), np.zeros((20, 1, 1, 2)))
+
+    monkeypatch.setattr("sb3_htr.adaptation.callbacks.record_adaptation", scripted)
+    model = tiny_pearl()
+    first, then = (MetaEvalCallback(ENV_ID, best_model_save_path=str(tmp_path), **settings) for _ in range(2))
+    model.learn(ROLLOUT, first)
+    then.load_state_dict(first.state_dict())
+    model.learn(ROLLOUT, then, reset_num_timesteps=False)
+    assert PEARL.load(tmp_path / "best_model").num_timesteps == ROLLOUT
+    assert (then.last_mean_reward, then.best_mean_reward) == (3.0, 5.0)
 
 
 def test_a_training_shorter_than_the_time_between_evaluations_is_evaluated_at_its_end(
@@ -116,6 +136,17 @@ def test_a_full_disk_stops_no_evaluation(tiny_pearl: MakePEARL, tmp_path: Path, 
     with pytest.warns(UserWarning, match=r"evaluations\.npz could not be written \(No space left on device\)"):
         tiny_pearl().learn(3 * ROLLOUT, callback=callback)
     assert len(np.load(tmp_path / "evaluations.npz")["timesteps"]) == 3, "the next one makes up for it"
+
+
+def test_evaluations_that_are_half_written_leave_those_before(
+    tiny_pearl: MakePEARL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    callback = MetaEvalCallback(ENV_ID, eval_freq=60, n_eval_episodes=1, log_path=str(tmp_path), verbose=0)
+    tiny_pearl().learn(ROLLOUT, callback)
+    monkeypatch.setattr(np, "savez_compressed", half_written)
+    with pytest.raises(KeyboardInterrupt):
+        tiny_pearl().learn(ROLLOUT, callback)
+    assert np.load(tmp_path / "evaluations.npz")["timesteps"].tolist() == [ROLLOUT]
 
 
 def test_a_best_model_that_could_not_be_written_is_not_the_best(

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import gymnasium as gym
@@ -213,6 +214,14 @@ def test_adapt_says_when_nothing_was_found(tiny_pearl: MakePEARL) -> None:
     assert not agent.successes.any()
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_the_returns_of_an_agent_are_all_that_it_was_paid(tiny_pearl: MakePEARL) -> None:
+    """Not what was more than the task-free reward."""
+    paid = gym.wrappers.TransformReward(gym.make(ENV_ID), lambda reward: float(reward) + 1.0)
+    agent = tiny_pearl().adapt(paid, n_episodes=3, task=np.array([9.0, 9.0]))
+    assert agent.returns.tolist() == [20.0] * 3
+
+
 def test_adapt_keeps_one_task_when_the_env_has_none(tiny_pearl: MakePEARL) -> None:
     env = gym.make(ENV_ID, goal_distance=5.0)  # out of reach, so that no untrained policy finds it by chance
     with pytest.warns(UserWarning, match="No reward"):
@@ -245,14 +254,16 @@ def test_bad_requests(tiny_pearl: MakePEARL, call: Callable[[PEARL], Any], messa
 
 
 def test_sampled_actions_leave_the_random_state_of_training_alone(tiny_pearl: MakePEARL) -> None:
-    model, results = tiny_pearl().learn(240), []
-    for seed in (3, 3, 4):
+    model, paths, tasks = tiny_pearl().learn(240), [], PointRobotFamily().test_tasks[:20]
+    for seed, deterministic in ((3, False), (3, False), (3, True), (4, True)):
         before = th.get_rng_state()
-        returns, _ = evaluate_adaptation(model, ENV_ID, n_episodes=2, explorer="prior", deterministic=False, seed=seed)
-        results.append(returns)
+        record = record_adaptation(model, ENV_ID, tasks, 2, explorer="prior", deterministic=deterministic, seed=seed)
+        paths.append(record.achieved)
         assert (th.get_rng_state() == before).all()
         th.randn(3)
-    assert (results[0] == results[1]).all()
+    assert (paths[0] == paths[1]).all()
+    for one, other in pairwise(paths[1:]):
+        assert (one != other).any(axis=(1, 2, 3)).all()
 
 
 @pytest.mark.parametrize("batched", [True, False])

@@ -295,6 +295,18 @@ def test_a_shorter_episode_beside_it_changes_nothing(tiny_pearl: MakePEARL) -> N
     assert search(np.array([200, 80])) == alone
 
 
+def test_z_is_chosen_forty_times_in_an_episode_of_known_length(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl()
+    know_tasks(model, 9)
+    adaptation, places = begin(model, "belief"), list[float]()
+    for i in range(400):
+        adaptation.explorer.look(np.zeros((1, 2), dtype=np.float32))
+        places.append(float(adaptation.z[0, 0]))
+        adaptation.observe(step([[places[-1], 0.0]], [0.0], i % 200 == 199))
+    turns = np.flatnonzero(np.diff(places[200:])) + 1
+    assert len(turns) > 20 and (turns % 5 == 0).all()
+
+
 def test_it_repeats_the_best_episode_unless_another_task_promises_more(tiny_pearl: MakePEARL) -> None:
     """Particle 1 is said to return 20 under task 0, and does not."""
     model = tiny_pearl()

@@ -14,6 +14,7 @@ from stable_baselines3 import HerReplayBuffer
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL, many
 from sb3_htr import PEARL, evaluate_adaptation
+from sb3_htr.adaptation.evaluation import record_adaptation
 from sb3_htr.common.vec_env import make_task_vec_env
 
 
@@ -127,7 +128,9 @@ def test_fuzzed_settings_are_taken_or_refused_in_one_sentence(kwargs: dict[str, 
 
 def test_a_meta_batch_may_be_larger_than_the_number_of_tasks(tiny_pearl: MakePEARL) -> None:
     env = make_task_vec_env(ENV_ID, 2, env_kwargs={"n_train_tasks": 2, "n_test_tasks": 1})
-    tiny_pearl(env, n_tasks_per_rollout=2, meta_batch_size=50).learn(2 * ROLLOUT)
+    model = tiny_pearl(env, n_tasks_per_rollout=2, meta_batch_size=50).learn(2 * ROLLOUT)
+    assert model._n_updates == 4 * 3 and model.replay_buffer is not None
+    assert len(model.replay_buffer.sample(4, meta_batch_size=50).lengths) == 50
 
 
 def test_one_update_a_rollout_is_warned_of() -> None:
@@ -162,12 +165,17 @@ def test_seeds_that_some_generator_would_not_take(tiny_pearl: MakePEARL, seed: A
     assert tiny_pearl(seed=np.int64(3)).seed == 3
 
 
+@pytest.mark.filterwarnings("ignore:No reward was found")
 def test_seeds_may_be_numbers_of_numpy(tiny_pearl: MakePEARL) -> None:
-    model = tiny_pearl()
+    model, paths = tiny_pearl(), []
     seeds: Any = np.arange(2)
     for seed in seeds:
-        model.adapt(ENV_ID, n_episodes=1, task=0, seed=seed)
-        evaluate_adaptation(model, ENV_ID, n_episodes=1, seed=seed)
+        given, plain = (model.adapt(ENV_ID, n_episodes=1, task=0, explorer="prior", seed=s) for s in (seed, int(seed)))
+        np.testing.assert_array_equal(given.z, plain.z)
+        ours, theirs = (record_adaptation(model, ENV_ID, explorer="prior", n_episodes=1, seed=s) for s in (seed, int(seed)))
+        np.testing.assert_array_equal(ours.achieved, theirs.achieved)
+        paths.append(ours.achieved)
+    assert (paths[0] != paths[1]).any()
 
 
 @pytest.mark.parametrize("total_timesteps", [-5, float("nan"), "1e5"])

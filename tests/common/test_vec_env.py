@@ -13,7 +13,8 @@ from gymnasium.error import ResetNeeded
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from helpers import ENV_ID
-from htr_envs import PointRobotVectorEnv, Trajectory
+from htr_envs import DynamicsVectorEnv, PointRobotFamily, PointRobotVectorEnv, Trajectory
+from htr_envs.point_robot import PointRobotDynamics
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
 
 
@@ -86,6 +87,22 @@ def test_an_observation_stays_what_it_was() -> None:
     env = BatchedTaskVecEnv(batch)
     seen = [env.reset(), *(env.step(np.ones((2, 2), dtype=np.float32))[0] for _ in range(2))]
     np.testing.assert_allclose(np.stack([np.asarray(obs)[0, 0] for obs in seen]), [0.0, 0.1, 0.2], atol=1e-6)
+
+
+class Ends(PointRobotDynamics):
+    """An episode ends where x is above 0.15."""
+
+    def step(self, actions: Any) -> Any:
+        states, rewards, _ = super().step(actions)
+        return states, rewards, states[:, 0] > 0.15
+
+
+def test_an_end_in_the_last_step_is_an_end() -> None:
+    env = BatchedTaskVecEnv(DynamicsVectorEnv(PointRobotFamily(), Ends(2), max_episode_steps=2))
+    env.reset()
+    for _ in range(2):
+        *_, dones, infos = env.step(np.eye(2, dtype=np.float32))
+    assert dones.all() and [info["TimeLimit.truncated"] for info in infos] == [False, True]
 
 
 def test_a_batch_is_as_single_envs_are_one_by_one() -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tables
+from matplotlib.figure import Figure
 
 from helpers import ENV_ID
 from helpers.results import made_up
@@ -69,9 +70,20 @@ def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monk
     experiment, folder = EXPERIMENTS[name], tmp_path / "results" / name
     cells = experiment.cells(3)
     monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 50)
+    drawn, finish = dict[str, str](), figures.finish
+
+    def noting(figure: Figure, path: Path, *about: Any) -> None:
+        drawn[path.stem] = str([axes.get_legend_handles_labels()[1] for axes in figure.axes])
+        finish(figure, path, *about)
+
+    monkeypatch.setattr(figures, "finish", noting)
     report.write(f"sb3-htr experiment {name}", experiment, made_up(cells, tmp_path), folder)
     pictures = {name, *(draw.__name__ for draw in experiment.also)}
-    assert all((folder / f"{picture}.png").stat().st_size > 10_000 for picture in pictures)
+    assert {path.name for path in folder.glob("*.png")} == {f"{picture}.png" for picture in pictures}
+    # Those of K are one line, and those of a single variant name its explorers
+    named = [cell.variant for cell in cells if not cell.variant.startswith("K = ")]
+    assert all(variant in text for variant in named for text in drawn.values())
+    assert {*drawn} == pictures - ({name} if experiment.figure is figures.evaluations else set())
     for method in {cell.method for cell in cells}:
         raw, own = np.load(folder / f"raw-{method}.npz"), [cell for cell in cells if cell.method == method]
         assert {key.split("/")[0] for key in raw.files} == {cell.name for cell in own}
@@ -140,6 +152,36 @@ def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monk
             assert line.endswith("| 1.0 [1.0, 1.0] |") != (name in tables.PASSED)
         n_timed = len(others) * (name not in tables.PASSED)
         assert tables.differences({name: endless}, {name: others}).count("| ≥ 1.0 [1.0, ∞), 0 of 3 never |") == n_timed
+
+
+def test_differences_are_of_the_first_one_less_the_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Variant or explorer."""
+    monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 50)
+    results = made_up(EXPERIMENTS["held_out_sector"].cells(2), tmp_path)
+    for cell, path in results.items():
+        raw = dict(np.load(path))
+        for evaluation in cell.evaluations:
+            raw[f"returns_{evaluation.name}"] -= 3.0 * (cell.method == "pearl-dense") + (evaluation.explorer == "prior")
+        np.savez(path, **raw)
+    summary = report.summarize("", results)
+    assert {row["iqm"] for row in summary["differences"]} == {3.0}
+    explorers = {(row["explorer"], row["of"], row["iqm"]) for row in summary["explorer_differences"]}
+    assert {explorer for explorer in explorers if explorer[2]} == {("prior", "belief", 1.0)}
+
+
+def test_returns_at_a_distance_are_shares_of_the_optimum_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    experiment, drawn = EXPERIMENTS["goal_distance"], list[tuple[np.ndarray, np.ndarray]]()
+    monkeypatch.setattr(figures, "band", lambda axes, x, scores, *_: drawn.append((x, scores)))
+    monkeypatch.setattr(figures, "finish", lambda *_: None)
+    results = made_up(experiment.cells(2), tmp_path)
+    for cell, path in results.items():
+        raw, share = dict(np.load(path)), cell.env_kwargs["goal_distance"]
+        raw["returns_belief"][:] = share * figures.optimal_return(**cell.env_kwargs)
+        np.savez(path, **raw)
+    figures.goal_distance(results, tmp_path / "picture.png")
+    assert len(drawn) == 2 * len({cell.variant for cell in results})
+    for x, shares in drawn[::2]:
+        np.testing.assert_allclose(shares, np.broadcast_to(x, shares.shape), rtol=1e-5)
 
 
 def test_agents_without_explorers_are_in_the_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,6 +15,7 @@ import yaml
 from torch import nn
 
 from helpers import ENV_ID
+from helpers.disks import half_written
 from helpers.results import made_up
 from helpers.runs import OF_CELL
 from sb3_htr import PEARL, evaluate_adaptation, make_task_vec_env
@@ -178,6 +179,15 @@ def test_a_last_checkpoint_that_cannot_be_written_is_no_interrupt(tmp_path: Path
     train.main([*cell.training(cell.run_folder(tmp_path)), "--save-freq", "1"])
     with pytest.raises(OSError, match="has its last model, but its last checkpoint could not be written"):
         run_cell(cell, tmp_path)
+
+
+def test_a_result_that_is_half_written_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (cell,) = Experiment("one", "", ENV_ID, 1200, (TINY,), 1).cells()
+    monkeypatch.setattr("sb3_htr.experiments.runner._train_and_evaluate", lambda *_: {"seed": 1})
+    monkeypatch.setattr(np, "savez_compressed", half_written)
+    with pytest.raises(KeyboardInterrupt):
+        run_cell(cell, tmp_path)
+    assert not cell.result(tmp_path).exists()
 
 
 def test_the_command_repeats_an_experiment(

@@ -1,9 +1,10 @@
-"""Small disks, for whoever may mount one."""
+"""Small disks, for whoever may mount one, and files that are half written."""
 
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -22,3 +23,9 @@ def disk(folder: Path, kilobytes: int, options: str = "rw") -> Iterator[Path]:
         yield path
     finally:
         subprocess.run(["umount", str(path)], check=True)
+
+
+def half_written(path: str | Path, *_: Any, **__: Any) -> None:
+    """In the place of what writes a file: whoever does so is stopped half-way."""
+    Path(path).write_bytes(b"half")
+    raise KeyboardInterrupt

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from helpers.experience import FAMILY, by_task, filled, make_buffer
 from htr_envs import Trajectory
 from sb3_htr.common.type_aliases import Context
-from sb3_htr.htr import HindsightTaskStrategy
+from sb3_htr.htr import HindsightTaskStrategy, SingleEpisodeRelabelling
 from sb3_htr.htr.relabel.hindsight_task import solved_at_start
 
 
@@ -143,6 +143,15 @@ def test_even_strategy_draws_tasks_that_are_rarely_reached_more_often() -> None:
     assert len(random) == len(even) == 20 * 64
     far = np.quantile(random, 0.9)
     assert (even > far).mean() > 0.25, "a tenth of all states is that far from the start"
+
+
+def test_a_place_that_no_other_episode_reached_is_as_rare_as_can_be() -> None:
+    buffer = make_buffer(n_envs=1, **relabelling())
+    assert isinstance(buffer.relabeller, SingleEpisodeRelabelling)
+    places = np.arange(12, dtype=np.float32).reshape(2, 3, 2)
+    first: Any = Trajectory(places[:, :1], places[:, :1], places[:, :1], np.zeros((2, 1), dtype=np.float32))
+    count = buffer.relabeller._count_alike(first, places, np.zeros((2, 3), dtype=np.int8))
+    np.testing.assert_array_equal(count, np.ones((2, 3)), err_msg="its own episode is no other")
 
 
 @given(st.lists(st.lists(st.floats(0.1, 100), min_size=3, max_size=3), min_size=1, max_size=5), st.integers(0, 99))

@@ -9,7 +9,7 @@ import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
 
-from helpers import ENV_ID, ROLLOUT, MakePEARL
+from helpers import ENV_ID, ROLLOUT, MakePEARL, parameters
 from helpers.experience import FAMILY, add_episode, by_task, filled, make_buffer
 from htr_envs import PointRobotFamily
 from sb3_htr import MultiTaskReplayBuffer, evaluate_adaptation
@@ -289,9 +289,12 @@ def test_bad_settings_are_refused(kind: dict[str, Any], message: str) -> None:
 def test_rewards_may_be_of_double_precision(
     kind: dict[str, Any], tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    own = PointRobotFamily.compute_reward
-    monkeypatch.setattr(PointRobotFamily, "compute_reward", lambda *a, **k: own(*a, **k).astype(np.float64))
-    tiny_pearl(replay_buffer_kwargs={"relabel_probability": 1.0, "relabeller": kind}).learn(2 * ROLLOUT)
+    own, learnt = PointRobotFamily.compute_reward, []
+    for kind_of_number in (np.float32, np.float64):
+        monkeypatch.setattr(PointRobotFamily, "compute_reward", lambda *a, t=kind_of_number, **k: own(*a, **k).astype(t))
+        model = tiny_pearl(replay_buffer_kwargs={"relabel_probability": 1.0, "relabeller": kind}).learn(2 * ROLLOUT)
+        learnt.append(parameters(model))
+    assert all(th.equal(learnt[1][name], value) for name, value in learnt[0].items())
 
 
 class Judge:

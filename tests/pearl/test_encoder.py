@@ -1,5 +1,6 @@
 """The posterior over z, against torch.distributions."""
 
+import pytest
 import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
@@ -39,6 +40,17 @@ def test_the_posterior_has_the_density_of_the_product_of_its_factors(seed: int, 
     difference = Normal(mean, variance.sqrt()).log_prob(points) - log_density
     # Equal up to a constant that normalizes
     th.testing.assert_close(difference, difference[:1].expand_as(difference), rtol=1e-6, atol=1e-6)
+
+
+def test_no_row_is_surer_than_the_smallest_variance() -> None:
+    encoder = ContextEncoder(CONTEXT_DIM, 1, [])
+    (last,) = encoder.factors.children()
+    assert isinstance(last, nn.Linear)
+    with th.no_grad():
+        last.weight.zero_()
+        last.bias.copy_(th.tensor([0.3, -200.0]))
+        mean, variance = posterior(encoder, th.randn(2, CONTEXT_DIM), [2])
+    assert mean.item() == pytest.approx(0.3) and variance.item() == pytest.approx(MIN_VARIANCE / 2)
 
 
 @given(seeds, st.lists(st.integers(0, 4), min_size=1, max_size=5), sizes)

@@ -300,6 +300,23 @@ def test_a_save_that_fails_leaves_the_old_model(tiny_pearl: MakePEARL, tmp_path:
     assert (tmp_path / "model.zip").read_bytes() == before and len(list(tmp_path.iterdir())) == 1
 
 
+def test_a_replay_buffer_that_cannot_be_written_leaves_the_old_one(
+    tiny_pearl: MakePEARL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = tiny_pearl().learn(ROLLOUT)
+    model.save_replay_buffer(tmp_path / "buffer.pt")
+    before = (tmp_path / "buffer.pt").read_bytes()
+
+    def write_half(state: Any, file: Any) -> None:
+        file.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(th, "save", write_half)
+    with pytest.raises(OSError, match="No space left"):
+        model.save_replay_buffer(tmp_path / "buffer.pt")
+    assert (tmp_path / "buffer.pt").read_bytes() == before and len([*tmp_path.iterdir()]) == 1
+
+
 def test_a_state_is_a_copy(tiny_pearl: MakePEARL) -> None:
     model = tiny_pearl(ent_coef="auto").learn(ROLLOUT)
     before, state = parameters(model), model.state_dict()

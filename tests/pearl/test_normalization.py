@@ -9,6 +9,7 @@ import torch as th
 from stable_baselines3.common.vec_env import VecNormalize
 
 from helpers import ENV_ID, ROLLOUT, MakePEARL, parameters, with_policy
+from helpers.adaptations import step
 from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.common.normalizer import ObservationNormalizer
 from sb3_htr.common.type_aliases import Context
@@ -95,6 +96,23 @@ def test_updates_see_normalized_observations(trained: PEARL, monkeypatch: pytest
     trained._update(4)
     expected = normalizer(trained)(data.observations)
     assert len(seen) == 2 and all(th.equal(obs, expected) for obs in seen)
+
+
+def test_an_adaptation_tells_what_is_task_free_by_normalized_observations(
+    trained: PEARL, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[th.Tensor] = []
+    task_free = trained.policy.reward_model.task_free
+
+    def noting(*given: th.Tensor) -> th.Tensor:
+        seen.extend(given)
+        return task_free(*given)
+
+    monkeypatch.setattr(trained.policy.reward_model, "task_free", noting)
+    now, then = (np.array([place], dtype=np.float32) for place in ([0.1, 0.2], [0.2, 0.1]))
+    trained.start_adaptation(1, "prior").observe(step(now, [0.0], False)._replace(next_observations=then))
+    for given, obs in ((seen[0], now), (seen[2], then)):
+        assert th.equal(given, normalizer(trained)(th.from_numpy(obs)))
 
 
 def test_evaluation_leaves_them_alone(trained: PEARL) -> None:

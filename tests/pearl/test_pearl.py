@@ -171,12 +171,14 @@ def test_any_number_of_envs(tiny_pearl: MakePEARL, n_envs: int) -> None:
         assert model.replay_buffer is not None and model.replay_buffer.size() == model.num_timesteps
 
 
-def test_envs_in_processes(tiny_pearl: MakePEARL) -> None:
+def test_envs_in_processes_teach_the_same(tiny_pearl: MakePEARL) -> None:
     env = make_vec_env(f"htr_envs:{ENV_ID}", 2, vec_env_cls=SubprocVecEnv)
     try:
-        tiny_pearl(env).learn(1)
+        apart = parameters(tiny_pearl(env).learn(1))
     finally:
         env.close()
+    together = parameters(tiny_pearl(make_vec_env(ENV_ID, 2)).learn(1))
+    assert all(th.equal(together[name], value) for name, value in apart.items())
 
 
 def test_every_training_task_has_its_turn(tiny_pearl: MakePEARL) -> None:
@@ -216,6 +218,13 @@ def test_callbacks_see_every_step_and_can_stop(tiny_pearl: MakePEARL) -> None:
     assert counter.calls == 7 and model.num_timesteps == 28
 
 
+def test_a_training_that_was_stopped_within_an_episode_goes_on_with_whole_ones(tiny_pearl: MakePEARL) -> None:
+    model = tiny_pearl().learn(ROLLOUT, callback=Counter(stop_after=7))
+    model.learn(2 * ROLLOUT, reset_num_timesteps=False)
+    assert model.replay_buffer is not None
+    assert np.diff(model.replay_buffer.episodes.index().episode_row).tolist() == [20] * 2 * 12
+
+
 def test_usual_arguments_of_learn(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
     model = tiny_pearl(tensorboard_log=str(tmp_path))
     model.learn(ROLLOUT, tb_log_name="name", log_interval=1, progress_bar=True)
@@ -226,12 +235,21 @@ def test_usual_arguments_of_learn(tiny_pearl: MakePEARL, tmp_path: Path) -> None
     assert model.num_timesteps == ROLLOUT
 
 
-def test_logs(tiny_pearl: MakePEARL) -> None:
-    model = tiny_pearl().learn(2 * ROLLOUT, log_interval=None)
+def test_what_is_logged_is_the_mean_over_updates(tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = tiny_pearl().learn(2 * ROLLOUT)
+    update, logs = model._update, list[dict[str, th.Tensor]]()
+
+    def noting(*given: Any) -> Any:
+        mean, log = update(*given)
+        logs.append(log)
+        return mean, log
+
+    monkeypatch.setattr(model, "_update", noting)
+    model.train(3)
     values = model.logger.name_to_value
-    assert 0 <= values["train/relabelled_fraction"] <= 1
-    assert values["train/kl_divergence"] > 0 and values["train/n_updates"] == 6
-    assert np.isfinite([v for k, v in values.items() if k.startswith("train/")]).all()
+    assert values["train/n_updates"] == 9 and len(logs) == 3 and values["train/kl_divergence"] > 0
+    for key in logs[0]:
+        assert values[f"train/{key}"] == pytest.approx(np.mean([log[key].item() for log in logs]), rel=1e-5), key
 
 
 @pytest.mark.parametrize("cuda_graph", [False, True, None])
@@ -336,11 +354,13 @@ def test_the_replay_buffer_is_saved_with_what_was_learnt_of_it(tiny_pearl: MakeP
 
 def test_schedules_end_where_they_should(tiny_pearl: MakePEARL) -> None:
     """The last rollout goes beyond the budget; a learning rate below 0 would undo what was learnt."""
-    model = tiny_pearl(learning_rate=LinearSchedule(1e-3, 0.0, 1.0))
+    model = tiny_pearl(ent_coef="auto", learning_rate=LinearSchedule(1e-3, 0.0, 1.0))
     model.learn(int(1.5 * ROLLOUT))
     assert model.num_timesteps == 2 * ROLLOUT
-    # Of the updates of the last rollout, which are those of its beginning
-    assert model.actor.optimizer.param_groups[0]["lr"] == pytest.approx(1e-3 / 3)
+    optimizers = [network.optimizer for network in (model.actor, model.critic, model.encoder, model.reward_model)]
+    for optimizer in (*optimizers, model.ent_coef_optimizer):
+        # Of the updates of the last rollout, which are those of its beginning
+        assert optimizer is not None and optimizer.param_groups[0]["lr"] == pytest.approx(1e-3 / 3)
 
 
 @pytest.mark.parametrize("n_rollouts", [1, 2])

@@ -3,10 +3,12 @@
 from itertools import count
 from typing import Any
 
+import numpy as np
 import pytest
 import torch as th
 
 from helpers import ROLLOUT, MakePEARL
+from helpers.experience import by_task
 from sb3_htr.pearl.encoder import kl_to_prior
 
 
@@ -64,6 +66,19 @@ def test_the_aggregate_is_of_the_latest_updates(tiny_pearl: MakePEARL, monkeypat
     monkeypatch.setattr(model, "_update", lambda *given: (th.full((1, 3), float(next(number))), update(*given)[1]))
     model.train(30)
     assert model.knowledge.mean.tolist() == [19.5] * 3, "of 10 to 29"
+
+
+def test_what_is_logged_of_a_meta_batch_is_that_of_its_tasks(tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = tiny_pearl(meta_batch_size=30).learn(2 * ROLLOUT)
+    assert model.replay_buffer is not None
+    data = model.replay_buffer.sample(8, meta_batch_size=30, context_size=20)
+    data = data._replace(unrewarded=np.arange(30) < 6, relabelled=np.arange(30) < 21)
+    monkeypatch.setattr(model.replay_buffer, "sample", lambda *_, **__: data)
+    _, log = model._update(8)
+    assert log["rl_zero_reward_fraction"].item() == pytest.approx(0.2)
+    assert log["relabelled_fraction"].item() == pytest.approx(0.7)
+    of_tasks = [rewards.mean() for rewards in by_task(data.rewards, data.lengths)]
+    assert any(of_tasks) and log["rl_reward_mean"].item() == pytest.approx(np.mean(of_tasks), rel=1e-4)
 
 
 def test_the_reward_model_learns_from_normalized_observations_of_the_labelled_rows(

@@ -2,6 +2,7 @@
 
 import errno
 import fcntl
+import json
 import multiprocessing
 import subprocess
 import sys
@@ -12,10 +13,12 @@ from typing import Any
 import pytest
 
 from helpers import ENV_ID
+from helpers.disks import half_written
 from helpers.runs import run_folder, train_arguments
 from sb3_htr import PEARL
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run.folder import claim, lock
+from sb3_htr.zoo.run.record import RECORD, write_record
 
 N_RACES, N_RUNNERS, N_RUNS = 20, 4, 90
 NEXT = range(N_RUNS + 1, N_RUNS + 1 + N_RUNNERS)
@@ -91,6 +94,14 @@ def test_a_run_has_its_owner_until_its_last_model_is_written(tmp_path: Path, mon
     assert main(train_arguments(Path("runs"), 240)) == 0
     assert saved[-1].name == f"{ENV_ID}.zip"
     lock(saved[-1].parent).release()
+
+
+def test_a_record_that_is_half_written_leaves_the_one_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_record(tmp_path, {"seed": 1})
+    monkeypatch.setattr(Path, "write_text", half_written)
+    with pytest.raises(KeyboardInterrupt):
+        write_record(tmp_path, {"seed": 2})
+    assert json.loads((tmp_path / RECORD).read_text()) == {"seed": 1}
 
 
 def test_without_locks_of_the_system_nothing_is_owned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -86,6 +86,27 @@ def test_paths_begin_at_the_start_and_name_their_task(drawn: list[Figure]) -> No
     assert all(way.shape == (5, 2) and (way[0] == 0).all() for way in ways)
 
 
+def test_the_curve_of_an_agent_is_what_was_returned_and_solved_in_an_episode_and_so_far(drawn: list[Figure]) -> None:
+    successes = np.array([[False, True, False], [False, False, False]])
+    record = AdaptationRecord(2.0 * successes, successes, np.zeros((2, 3, 1, 2)))
+    adaptation.plot_adaptation_curve(record, Path("x.png"), "about")
+    lines = [line for axes in drawn[0].axes for line in axes.get_lines()]
+    shown = {line.get_label(): np.asarray(line.get_ydata()).tolist() for line in lines}
+    assert shown == {"mean over tasks": [0, 1, 0], "in this episode": [0, 50, 0], "so far": [0, 50, 50]}
+
+
+def test_a_learning_curve_is_of_the_env_steps_at_which_all_runs_were_evaluated(tmp_path: Path) -> None:
+    agents = list[TrainedAgent]()
+    for name, steps in (("a", [1000, 2000, 3000]), ("b", [2000, 3000])):
+        agents.append(TrainedAgent(tmp_path / name / "x.zip", {"method": "htr-ser"}, tmp_path / name))
+        (tmp_path / name).mkdir()
+        returns = np.array(steps)[:, None, None] * np.ones((1, 4, 2))
+        np.savez(tmp_path / name / "evaluations.npz", timesteps=steps, returns=returns, successes=returns > 2500)
+    curve = plot.learning_curve("both", agents)
+    assert curve is not None and curve.x.tolist() == [2, 3]
+    assert curve.returns.tolist() == [[2000, 3000]] * 2 and curve.successes.tolist() == [[0, 1]] * 2
+
+
 def test_curves_say_what_they_show(drawn: list[Figure], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 200)
     for n_seeds, n_points, said in (

@@ -22,9 +22,11 @@ import sb3_htr
 from helpers import ENV_ID, TINY
 from helpers.runs import run_folder, train_arguments
 from sb3_htr import PEARL
+from sb3_htr.adaptation.evaluation import AdaptationRecord
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.zoo.cli import main
+from sb3_htr.zoo.commands.evaluate import table
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback
 from sb3_htr.zoo.run.malloc import keep_freed_memory
 from sb3_htr.zoo.run.manager import MetaExperimentManager
@@ -72,6 +74,16 @@ def test_evaluate_prints_a_table_and_draws_pictures(
     for picture in (f"adaptation_curve{about}.png", f"adaptation_paths{about}.png"):
         assert (run / picture).read_bytes().startswith(b"\x89PNG")
         assert (run / picture).stat().st_size > 10_000
+
+
+def test_the_table_says_what_was_solved_in_an_episode_and_so_far() -> None:
+    successes = np.array([[False, True, False], [False, False, False]])
+    lines = table(AdaptationRecord(2.0 * successes, successes, np.zeros((2, 3, 1, 2)))).splitlines()[1:]
+    assert [line.split() for line in lines] == [
+        ["1", "0.00", "0.00", "..", "0.00", "0%", "0%"],
+        ["2", "1.00", "0.50", "..", "1.50", "50%", "50%"],
+        ["3", "0.00", "0.00", "..", "0.00", "0%", "50%"],
+    ]
 
 
 def test_evaluations_of_one_run_do_not_replace_each_other(runs: Path, tmp_path: Path) -> None:
