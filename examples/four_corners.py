@@ -50,8 +50,8 @@ class FourCornersEnv(DynamicsEnv):
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": []}  # type: ignore[misc]
 
-    def __init__(self, reward_type: str = "sparse", **family_kwargs: Any) -> None:
-        super().__init__(FourCornersFamily(**family_kwargs), PointRobotDynamics(1), reward_type)
+    def __init__(self, reward_type: str = "sparse", render_mode: str | None = None, **family_kwargs: Any) -> None:
+        super().__init__(FourCornersFamily(**family_kwargs), PointRobotDynamics(1), reward_type, render_mode)
 
 
 class FourCornersVectorEnv(DynamicsVectorEnv):

@@ -447,7 +447,7 @@ def _check_batch(batch: Any, env: gym.Env[Any, Any], family: TaskFamily, seed: i
     finite = bool(np.isfinite(observations).all())
     _require(finite, "The batch of the id begins with an observation that is not finite: see its _reset_state.")
     if not _same(observations[0], episode.traj.observations[0]):
-        drawn = not _same(observations[0], start(seed + 1)[0])
+        drawn = any(not _same(observations[0], start(seed + i)[0]) for i in range(1, N_DRAWS))
         _require(
             drawn, "The batch of the id begins elsewhere than the env itself, and not by chance: each seed has this start."
         )

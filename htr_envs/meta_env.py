@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
+from gymnasium.utils import seeding
 from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float32]
@@ -146,6 +147,15 @@ def task_from_options(options: dict[str, Any] | None) -> tuple[str, Any] | None:
     return next(iter(options.items()))
 
 
+def check_seed(seed: int | None) -> None:
+    """Refuse one that gymnasium would, before anything is taken.
+
+    :raises gymnasium.error.Error: for a seed that is none.
+    """
+    if seed is not None:
+        seeding.np_random(seed)
+
+
 def checked_action(action: ArrayLike, space: spaces.Space[Any]) -> NDArray[np.float32]:
     """A float32 copy of an action, or of one for each env.
 
@@ -259,6 +269,7 @@ class MetaEnv(HasTaskFamily, gym.Env[FloatArray, FloatArray], ABC):
         :raises ValueError: if an option is unknown or its task is invalid.
         """
         chosen = task_from_options(options)
+        check_seed(seed)
         if chosen is not None:
             self._give(*chosen)
         super().reset(seed=seed)  # not before: a reset that is refused changes nothing

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from abc import abstractmethod
 from collections.abc import Callable
+from numbers import Real
 from typing import Any, ClassVar
 from weakref import WeakSet
 
@@ -281,10 +282,9 @@ def finite_float(name: str, value: float) -> np.float32:
     :return: the same.
     :raises ValueError: if it is not finite.
     """
-    number = np.float32(value)
-    if not np.isfinite(number):
-        raise ValueError(f"{name} is {value}, expected a finite number.")
-    return number
+    if not isinstance(value, Real) or not abs(value) <= np.finfo(np.float32).max:
+        raise ValueError(f"{name} is {value!r}, expected a finite number of float32.")
+    return np.float32(value)
 
 
 def _add_discs(spec: mujoco.MjSpec) -> None:

@@ -19,12 +19,12 @@ def check_task_sets(n_train_tasks: int, n_validation_tasks: int, n_test_tasks: i
     :raises ValueError: if one is no whole number, or out of range.
     """
     sizes = n_train_tasks, n_validation_tasks, n_test_tasks
-    if not all(isinstance(n, int | np.integer) and n >= 1 for n in sizes):
+    if not all(isinstance(n, int | np.integer) and n >= 1 and n is not True for n in sizes):
         told = ", ".join(map(repr, sizes))
         raise ValueError(
             f"n_train_tasks, n_validation_tasks, n_test_tasks are {told}: each must be a whole number of at least 1."
         )
-    if not isinstance(task_seed, int | np.integer) or not 0 <= task_seed < 2**32:
+    if not isinstance(task_seed, int | np.integer) or isinstance(task_seed, bool) or not 0 <= task_seed < 2**32:
         raise ValueError(f"task_seed is {task_seed!r}, expected a whole number from 0 to {2**32 - 1}.")
 
 

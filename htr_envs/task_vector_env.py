@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from htr_envs.meta_env import checked_action, task_from_options
+from htr_envs.meta_env import check_seed, checked_action, task_from_options
 from htr_envs.task_env import BoolArray, FloatArray, HasRewardHooks, TaskFamily, Trajectory, check_reward_type, told_by_hook
 
 
@@ -137,6 +137,7 @@ class TaskVectorEnv(HasRewardHooks, VectorEnv[FloatArray, FloatArray, NDArray[An
         """
         chosen = task_from_options(options)
         everyone = np.arange(self.num_envs)
+        check_seed(seed)
         if chosen is not None:
             self._give(*chosen, everyone)
         super().reset(seed=seed)  # not before: a reset that is refused changes nothing

@@ -67,7 +67,6 @@ def import_example(module: str) -> None:
 def test_a_family_of_the_examples_is_one(module: str) -> None:
     import_example(module)
     env = gym.make(FAMILIES[module])
-    assert ("render_mode" in inspect.signature(type(env.unwrapped)).parameters) == bool(env.metadata["render_modes"])
     assert env.unwrapped.render() is None
     check_task_env(env)
     kwargs = {**TINY, "policy_kwargs": with_policy(normalize_observations=True)}

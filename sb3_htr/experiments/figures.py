@@ -14,7 +14,7 @@ from sb3_htr.experiments.calibration import expected_calibration_error
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.protocol import SOLVED_SHARE, scores
 from sb3_htr.experiments.runner import in_training
-from sb3_htr.zoo.plots.curves import OF_FEW, band, finish
+from sb3_htr.zoo.plots.curves import band, finish
 from sb3_htr.zoo.plots.intervals import iqm_interval
 from sb3_htr.zoo.plots.style import BLUE, GREY, curve_colours, save
 
@@ -49,8 +49,9 @@ def n_seeds(results: Results) -> int:
 
 def _title(results: Results) -> str:
     n = n_seeds(results)
-    few = {1: "one seed, 95 % interval over tasks and evaluation seeds", **OF_FEW}
-    return f"{next(iter(results)).env_id}: {few.get(n, f'IQM over {n} seeds, 95 % interval')}"
+    # The IQM of three is their mean
+    shown = "one seed" if n == 1 else f"{'mean' if n < 4 else 'IQM'} over {n} seeds, 95 % interval"
+    return f"{next(iter(results)).env_id}: {shown}"
 
 
 def label(variant: str, runs: list[tuple[Cell, Any]], results: Results) -> str:
@@ -61,6 +62,15 @@ def label(variant: str, runs: list[tuple[Cell, Any]], results: Results) -> str:
     :return: the name, with the number of runs where others have more
     """
     return variant if len(runs) == n_seeds(results) else f"{variant} (seeds: {len(runs)})"
+
+
+def explorer_lines(cell: Cell) -> dict[str, str]:
+    """
+    :param cell: of a variant
+    :return: lines of the explorers whose adaptation curves are drawn, that of its evaluations in training and the prior
+    """
+    lines = {"prior": "--", in_training(cell).explorer: "-"}
+    return {own.explorer: lines[own.explorer] for own in cell.evaluations if not own.tested_on and own.explorer in lines}
 
 
 def curves(runs: Sequence[Any], key: str) -> tuple[np.ndarray, np.ndarray]:
@@ -83,23 +93,25 @@ def learning(results: Results, path: Path) -> None:
     """
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
     groups = by_variant(results)
+    lines = {variant: explorer_lines(runs[0][0]) for variant, runs in groups.items()}
+    # In the titles where there is one alone
+    explorers = {explorer for shown in lines.values() for explorer in shown}
+    of_all, ends = (f", {min(explorers)}", {min(explorers): ""}) if len(explorers) == 1 else ("", {})
     for colour, (variant, runs) in zip(curve_colours([*groups]), groups.items(), strict=True):
         timesteps, curve = curves([raw for _, raw in runs], "curve")
         name, own = label(variant, runs, results), in_training(runs[0][0]).explorer
-        band(left, timesteps / 1000, curve, colour, "-", f"{name}, {own}")
-        explorers = [evaluation.explorer for evaluation in runs[0][0].evaluations if not evaluation.tested_on]
-        styles = {"prior": "--", own: "-"}
-        for explorer in [explorer for explorer in explorers if explorer in styles]:
+        band(left, timesteps / 1000, curve, colour, "-", name + ends.get(own, f", {own}"))
+        for explorer, line in lines[variant].items():
             returns = np.stack([raw[f"returns_{explorer}"] for _, raw in runs])
-            band(right, np.arange(1, returns.shape[-1] + 1), returns, colour, styles[explorer], f"{name}, {explorer}")
+            band(right, np.arange(1, returns.shape[-1] + 1), returns, colour, line, name + ends.get(explorer, f", {explorer}"))
     left.set_xlim(left=0)
     left.set_xlabel("thousand env steps of meta-training")
     left.set_ylabel("return of the last adaptation episode")
-    left.set_title("validation tasks, during meta-training (interval over seeds)", fontsize=9)
+    left.set_title(f"validation tasks, during meta-training{of_all} (interval over seeds)", fontsize=9)
     right.set_xlabel("adaptation episode")
     right.set_ylabel("return")
     right.xaxis.get_major_locator().set_params(integer=True)
-    right.set_title("test tasks, final models (over seeds, tasks and evaluation seeds)", fontsize=9)
+    right.set_title(f"test tasks, final models{of_all} (over seeds, tasks and evaluation seeds)", fontsize=9)
     finish(figure, path, _title(results))
 
 

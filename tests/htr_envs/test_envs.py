@@ -374,6 +374,9 @@ def test_a_vector_outside_the_task_space_is_refused_and_changes_nothing(env_id: 
     vector.set_task([4, 5])
     with pytest.raises(ValueError, match="not in"):
         vector.reset(options={"task": np.stack([base.train_tasks[0], task])})
+    for refused, task_id in ((env, 1), (vector, [1, 1])):
+        with pytest.raises(gym.error.Error, match="Seed must be"):
+            refused.reset(seed=-1, options={"task_id": task_id})
     assert env.reset()[1]["task_id"] == 4
     assert vector.reset()[1]["task_id"].tolist() == [4, 5]
 
