@@ -23,6 +23,8 @@ from sb3_htr.zoo.plots.style import COLOURS
 
 ENV_ID = "Scaling-v0"
 PICTURE = Path(__file__).parents[1] / "docs" / "cost.svg"
+# How many of each a millisecond is
+PER_MS = {"ms": 1.0, "microseconds": 1000.0}
 # Seconds that a point takes, about, after its set-up
 PATIENCE = 0.5
 
@@ -231,13 +233,16 @@ def plot(panels: list[tuple[str, list[int], Curves]]) -> None:
     """
     :param panels: what :func:`measure` gives
     """
-    figure, all_axes = plt.subplots(2, 3, figsize=(13, 7.6), layout="constrained")
+    figure, all_axes = plt.subplots(2, 3, figsize=(13, 8), layout="constrained", sharey=True)
+    colours = dict(zip(dict.fromkeys(what for _, _, curves in panels for what in curves), COLOURS, strict=False))
     for axes, (name, sizes, curves) in zip(all_axes.flat, panels, strict=True):
-        for colour, (what, (unit, values)) in zip(COLOURS, curves.items(), strict=False):
-            axes.loglog(sizes, values, "o-", color=colour, label=f"{what} ({unit})", markersize=4)
+        for what, (unit, values) in curves.items():
+            durations = np.array(values) / PER_MS[unit]
+            axes.loglog(sizes, durations, "o-", color=colours[what], label=what, markersize=4)
         axes.set_xlabel(name)
-        axes.set_ylim(0.02, 2e4)
-    finish(figure, PICTURE, "Duration as work grows, one thread; both axes are logarithmic")
+    for axes in all_axes[:, 0]:
+        axes.set_ylabel("ms")
+    finish(figure, PICTURE, "Duration as work grows, one thread; both axes are logarithmic", legend_columns=1)
 
 
 def main() -> None:
