@@ -94,16 +94,17 @@ def learning(results: Results, path: Path) -> None:
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
     groups = by_variant(results)
     lines = {variant: explorer_lines(runs[0][0]) for variant, runs in groups.items()}
-    # In the titles where there is one alone
     explorers = {explorer for shown in lines.values() for explorer in shown}
-    of_all, ends = (f", {min(explorers)}", {min(explorers): ""}) if len(explorers) == 1 else ("", {})
+    # In the titles where there is one alone, else in the legends
+    of_all = f", {min(explorers)}" if len(explorers) == 1 else ""
     for colour, (variant, runs) in zip(curve_colours([*groups]), groups.items(), strict=True):
         timesteps, curve = curves([raw for _, raw in runs], "curve")
         name, own = label(variant, runs, results), in_training(runs[0][0]).explorer
-        band(left, timesteps / 1000, curve, colour, "-", name + ends.get(own, f", {own}"))
+        band(left, timesteps / 1000, curve, colour, "-", name if of_all else f"{name}, {own}")
         for explorer, line in lines[variant].items():
             returns = np.stack([raw[f"returns_{explorer}"] for _, raw in runs])
-            band(right, np.arange(1, returns.shape[-1] + 1), returns, colour, line, name + ends.get(explorer, f", {explorer}"))
+            of_line = name if of_all else f"{name}, {explorer}"
+            band(right, np.arange(1, returns.shape[-1] + 1), returns, colour, line, of_line)
     left.set_xlim(left=0)
     left.set_xlabel("thousand env steps of meta-training")
     left.set_ylabel("return of the last adaptation episode")

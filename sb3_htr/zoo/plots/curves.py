@@ -15,9 +15,6 @@ N_MARKERS = 12
 # Hollow and each of another shape, so that of curves that coincide, as where nothing is solved, all are seen
 MARKERS = dict(zip(COLOURS, "oXD^vxsph*", strict=True))
 
-# What is shown of so few seeds: of three the IQM is the mean, and of two its bootstrap interval their range
-OF_FEW = {2: "mean and range of 2 seeds", 3: "mean of 3 seeds, 95 % interval"}
-
 
 def band(axes: plt.Axes, x: np.ndarray, scores: np.ndarray, colour: str, style: str, label: str, alpha: float = 0.2) -> None:
     """
@@ -94,6 +91,7 @@ def plot_curves(curves: dict[str, Curve], path: Path, title: str, x_label: str, 
         axes.set_xlabel(x_label)
         axes.xaxis.get_major_locator().set_params(integer=True)
     span_unit_if_flat(left)
+    # Of three seeds and fewer, the IQM is the mean, and of two its bootstrap interval their range
     seeds = {min(len(curve.returns), 4) for curve in curves.values()}
-    shown = {4: "IQM over seeds, 95 % interval", **dict(sorted(OF_FEW.items(), reverse=True))}
+    shown = {4: "IQM over seeds, 95 % interval", 3: "mean of 3 seeds, 95 % interval", 2: "mean and range of 2 seeds"}
     finish(figure, path, "; ".join([title, *(text for n, text in shown.items() if n in seeds)]))
