@@ -1,9 +1,10 @@
-"""What is in the wheel, tried from an empty folder."""
+"""What is in the sdist and in the wheel that is built from it, tried from an empty folder."""
 
 import os
 import shutil
 import subprocess
 import sys
+import tarfile
 import zipfile
 from configparser import ConfigParser
 from pathlib import Path
@@ -13,7 +14,8 @@ import pytest
 from helpers.runs import SMALL
 
 ROOT = Path(__file__).parents[1]
-SOURCES = ("sb3_htr", "htr_envs", "hyperparams", "trained_agents", "setup.cfg", "pyproject.toml", "README.md", "LICENSE")
+BESIDE = ("CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "constraints.txt", "pyproject.toml", "README.md", "LICENSE")
+SOURCES = ("sb3_htr", "htr_envs", "hyperparams", "trained_agents", "tests", "setup.cfg", "MANIFEST.in", *BESIDE)
 
 
 def test_setup_cfg_lists_every_package() -> None:
@@ -29,6 +31,12 @@ def test_setup_cfg_lists_every_package() -> None:
     assert listed == found | {"sb3_htr.hyperparams", "sb3_htr.trained_agents"}
 
 
+def test_one_version_is_told_everywhere() -> None:
+    version = (ROOT / "sb3_htr" / "version.txt").read_text().strip()
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
+    assert (ROOT / "CHANGELOG.md").read_text().startswith(f"# Changelog\n\n## Release {version} ")
+
+
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where the wheel is unpacked."""
@@ -38,11 +46,15 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
             shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
         else:
             shutil.copy(ROOT / name, source)
-    build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(dist), str(source)]
+    build = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(dist), str(source)]
     subprocess.run(build, check=True, capture_output=True)
+    (sdist,) = dist.glob("*.tar.gz")
+    with tarfile.open(sdist) as archive:
+        inside = {name.partition("/")[2] for name in archive.getnames()}
+    assert inside.issuperset(BESIDE) and not any(name.startswith("tests") for name in inside)
     (wheel,) = dist.glob("*.whl")
-    with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(site)
+    with zipfile.ZipFile(wheel) as unpacked:
+        unpacked.extractall(site)
     assert {path.name for path in site.iterdir() if path.suffix != ".dist-info"} == {"sb3_htr", "htr_envs"}
     return site
 

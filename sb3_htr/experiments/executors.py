@@ -12,7 +12,7 @@ from threading import Lock, Thread
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
-from sb3_htr.pearl.divergence import DivergedError
+from sb3_htr.common.divergence import DivergedError
 
 T = TypeVar("T")
 # Of a GPU, for a run: five were trained side by side on one, docs/performance.md

@@ -9,11 +9,12 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_htr.adaptation.explorers import Explorer
+from sb3_htr.common.divergence import check_not_diverged
 from sb3_htr.common.segments import repeat_segments
 from sb3_htr.common.settings import LOWEST, check_flags, check_numbers
 from sb3_htr.common.type_aliases import MultiTaskSamples, RewardLabels
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
-from sb3_htr.pearl.divergence import check_not_diverged, check_posterior
+from sb3_htr.pearl.divergence import check_posterior
 from sb3_htr.pearl.encoder import ContextEncoder, kl_to_prior
 from sb3_htr.pearl.graphed_update import FixedUpdate, GraphedUpdate, Outcome, can_be_captured
 from sb3_htr.pearl.matmul import PRECISIONS, matmul_precision

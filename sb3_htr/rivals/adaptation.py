@@ -42,6 +42,7 @@ class RivalAdaptation(ABC):
         :param obs: (n_envs, obs_dim)
         :param deterministic: mean actions instead of samples
         :return: (n_envs, action_dim), scaled to [-1, 1]
+        :raises ValueError: for observations of another number of envs, NaN and infinity
         """
 
     def observe(self, step: Step) -> None:
@@ -93,6 +94,12 @@ class ToldAdaptation(RivalAdaptation):
         self._tasks = tasks
 
     def act(self, obs: np.ndarray, deterministic: bool = True) -> np.ndarray:
+        """
+        :param obs: (n_envs, obs_dim)
+        :param deterministic: mean actions instead of samples
+        :return: (n_envs, action_dim), scaled to [-1, 1]
+        :raises ValueError: before the tasks were told; for observations of another number of envs, NaN and infinity
+        """
         if self._tasks is None:
             raise ValueError("Who acts here is told its tasks: call see_tasks, with a row for each env, first.")
         self._check_observations(obs)

@@ -24,16 +24,17 @@ from sb3_htr.common.checks import (
     check_is_not_normalized,
     get_task_family,
 )
+from sb3_htr.common.divergence import check_not_diverged
 from sb3_htr.common.random_state import checked_seed
 from sb3_htr.common.saving import CheckedFiles
-from sb3_htr.common.settings import check_keywords, check_numbers
+from sb3_htr.common.settings import LOWEST, check_keywords, check_layers, check_numbers
 from sb3_htr.common.training_state import Resumable
 from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env, set_tasks
 from sb3_htr.common.vec_wrappers import in_float32, seed_envs
 from sb3_htr.rivals.adaptation import OwnWay, check_explores_in_own_way
 
 SelfRival = TypeVar("SelfRival", bound="Rival")
-# Settings of SB3's algorithms which these do not check: smallest and largest value
+# Settings of SB3's algorithms and policies which these do not check: smallest and largest value
 RANGES: dict[str, tuple[float] | tuple[float, float]] = {
     "learning_rate": (0.0,),
     "gamma": (0.0, 1.0),
@@ -41,7 +42,9 @@ RANGES: dict[str, tuple[float] | tuple[float, float]] = {
     "gae_lambda": (0.0, 1.0),
     "clip_range": (0.0,),
     "clip_range_vf": (0.0,),
+    "target_kl": (0.0,),
     "ent_coef": (0.0,),
+    "target_entropy": (LOWEST,),
     "vf_coef": (0.0,),
     "max_grad_norm": (0.0,),
     "batch_size": (1,),
@@ -51,7 +54,13 @@ RANGES: dict[str, tuple[float] | tuple[float, float]] = {
     "n_steps": (1,),
     "policy_delay": (1,),
     "target_update_interval": (1,),
+    "n_critics": (1,),
+    "lstm_hidden_size": (1,),
+    "n_lstm_layers": (1,),
 }
+# Of these, 0 keeps networks from learning: target networks, that of values, or all
+ABOVE_ZERO = ("tau", "clip_range_vf", "target_kl")
+OF_SDE = "it is of use_sde, which is none either"
 
 
 class ResetCallback(BaseCallback):
@@ -114,7 +123,13 @@ class Rival(CheckedFiles, Resumable):
     POLICY_SIZES: ClassVar[dict[str, int]] = {}
     #: Settings, whole numbers, that an agent which is loaded to act has of its training
     ACTS_BY: ClassVar[tuple[str, ...]] = ()
-    FOLLOWS: ClassVar[dict[str, str]] = {"use_sde": "its noise is drawn before a rollout, and in no checkpoint"}
+    #: Settings that may be ``"auto"``, too
+    MAY_BE_AUTO: ClassVar[tuple[str, ...]] = ()
+    FOLLOWS: ClassVar[dict[str, str]] = {
+        "use_sde": "its noise is drawn before a rollout, and in no checkpoint",
+        "sde_sample_freq": OF_SDE,
+        "use_sde_at_warmup": OF_SDE,
+    }
     explorer = OwnWay()
 
     def __init__(self, policy: Any, env: GymEnv | str | None, seed: int | None = None, **kwargs: Any) -> None:
@@ -145,21 +160,22 @@ class Rival(CheckedFiles, Resumable):
         self.check_names(settings)
         self._check_ranges(settings)
         policy_class = self.policy_aliases.get(policy) if isinstance(policy, str) else policy
+        of_policy = settings.get("policy_kwargs") or {}
         if policy_class is not None:
-            check_keywords("policy_kwargs", settings.get("policy_kwargs") or {}, policy_class)
+            check_keywords("policy_kwargs", of_policy, policy_class)
+        self._check_ranges(of_policy)
+        if (net_arch := of_policy.get("net_arch")) is not None:
+            check_layers(**net_arch if isinstance(net_arch, dict) else {"net_arch": net_arch})
         return checked_seed(seed)
 
-    @staticmethod
-    def _check_ranges(settings: dict[str, Any]) -> None:
+    def _check_ranges(self, settings: dict[str, Any]) -> None:
         for name, value in settings.items():
-            # Schedules, and an entropy coefficient that is learnt, are the library's to read
-            if (
-                name in RANGES
-                and value is not None
-                and not callable(value)
-                and not (name == "ent_coef" and isinstance(value, str))
-            ):
+            # Schedules, and "auto_0.1", are the library's to read
+            is_auto = name in self.MAY_BE_AUTO and str(value).startswith("auto")
+            if name in RANGES and value is not None and not callable(value) and not is_auto:
                 check_numbers(**{name: (value, *RANGES[name])})
+                if name in ABOVE_ZERO and value == 0:
+                    raise ValueError(f"{name} is {value}, which keeps networks from learning: expected a number above 0.")
 
     def _setup_model(self) -> None:
         # Not in the constructor alone: settings can be given to load, too, in place of those of the file
@@ -272,6 +288,19 @@ class Rival(CheckedFiles, Resumable):
         self._log_interval = log_interval
         # The library counts from where a training was resumed; a rival asks :attr:`logs_now`
         return super().learn(total_timesteps, callback, 1, *args, **kwargs)  # type: ignore[safe-super]
+
+    def train(self, *args: Any, **kwargs: Any) -> None:
+        """
+        As the library's, of what was collected.
+
+        :param args: see Stable-Baselines3's
+        :param kwargs: likewise
+        :raises DivergedError: if a weight is not finite afterwards
+        """
+        try:
+            super().train(*args, **kwargs)  # type: ignore[misc]
+        finally:  # also where the library stumbles over such weights, in words of its own
+            check_not_diverged(self.policy, {}, self._n_updates, self.num_timesteps)
 
     @property
     @abstractmethod

@@ -23,6 +23,7 @@ class OffPolicyRival(Rival, OffPolicyAlgorithm):
     """
 
     ACTS_WITH: ClassVar[dict[str, Any]] = {"buffer_size": 1}
+    MAY_BE_AUTO: ClassVar[tuple[str, ...]] = ("ent_coef", "target_entropy")
     FOLLOWS: ClassVar[dict[str, str]] = {
         **Rival.FOLLOWS,
         "train_freq": "a rollout is an episode of each env",
@@ -83,9 +84,9 @@ class OffPolicyRival(Rival, OffPolicyAlgorithm):
         return {**super().state_dict(), "replay": replay_state(self.replay_buffer)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        super().load_state_dict(state)
         assert self.replay_buffer is not None
-        load_replay_state(self.replay_buffer, state["replay"])
+        load_replay_state(self.replay_buffer, state["replay"])  # refuses what does not fit before anything is taken
+        super().load_state_dict(state)
 
 
 def end_episodes(buffer: ReplayBuffer) -> None:
@@ -104,8 +105,7 @@ def replay_state(buffer: ReplayBuffer) -> dict[str, Any]:
     :param buffer: of Stable-Baselines3
     :return: what it stores, as tensors and numbers, for :func:`load_replay_state`
     """
-    end = buffer.buffer_size if buffer.full else buffer.pos
-    arrays = {name: th.from_numpy(array[:end].copy()) for name, array in _arrays(buffer).items()}
+    arrays = {name: th.from_numpy(array[: buffer.size()].copy()) for name, array in _arrays(buffer).items()}
     return {"arrays": arrays, "pos": buffer.pos, "full": buffer.full}
 
 
@@ -113,10 +113,19 @@ def load_replay_state(buffer: ReplayBuffer, state: dict[str, Any]) -> None:
     """
     :param buffer: with the settings of the one that the state is of
     :param state: of :func:`replay_state`
+    :raises ValueError: if it is of a buffer of another size, or another number of envs
     """
+    n_saved, n_envs = state["arrays"]["rewards"].shape
+    fits = n_saved == buffer.buffer_size if state["full"] else n_saved <= buffer.buffer_size
+    if not fits or n_envs != buffer.n_envs:
+        raise ValueError(
+            f"The replay of the training has {n_saved} steps of each of {n_envs} envs, and the buffer is of "
+            f"{buffer.buffer_size} of each of {buffer.n_envs}: give the model the training's buffer_size, and as many envs."
+        )
     for name, array in _arrays(buffer).items():
-        saved = state["arrays"][name].cpu().numpy()
-        array[: len(saved)] = saved
+        array[:n_saved] = state["arrays"][name].cpu().numpy()
+        # HER draws whatever is of a whole episode. Where nothing was stored, memory is not yet taken
+        array[n_saved : buffer.size()] = 0
     buffer.pos, buffer.full = state["pos"], state["full"]
 
 

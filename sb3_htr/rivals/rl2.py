@@ -14,7 +14,6 @@ from sb3_htr.adaptation.adaptation import Step
 from sb3_htr.adaptation.loop import Adapting
 from sb3_htr.common.checks import get_max_episode_steps
 from sb3_htr.common.settings import check_numbers
-from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
 from sb3_htr.rivals.adaptation import RivalAdaptation
 from sb3_htr.rivals.on_policy import OnPolicyRival
 from sb3_htr.rivals.trial_policy import TrialFeatures, TrialLstmPolicy
@@ -78,13 +77,14 @@ class RL2(OnPolicyRival, RecurrentPPO):
     :param policy: ``"MlpLstmPolicy"`` or a class
     :param env: env of a task family, VecEnv of such envs, or registered id
     :param n_episodes_per_trial: episodes on each task. By RL2's objective all of them count, and the critic looks beyond their
-        ends
-    :param n_trials_per_rollout: trials of each env between two updates
+        ends. The default is our choice: RL2's papers have 2 to 100, by the task
+    :param n_trials_per_rollout: trials of each env between two updates. The default is our choice: 80 of 20 envs
     :param seed: seed of all random generators
-    :param kwargs: arguments of ``RecurrentPPO`` but ``n_steps``, which follows. ``batch_size`` is four trials by default, and
+    :param kwargs: arguments of ``RecurrentPPO`` but those in :attr:`FOLLOWS`. ``batch_size`` is four trials by default, and
         ``gamma`` reaches over a trial: 1 - 1 / steps of a trial, which is the library's 0.99 on the Point Robot. In ``load``
         they do not follow trials of another length: they are settings of the file
-    :raises ValueError: for an env without tasks or time limit, or a number that is out of its range
+    :raises ValueError: for a setting that is unknown or out of its range, an env without tasks or time limit, or a
+        ``batch_size`` that leaves a minibatch of one step
     """
 
     DEFAULT_POLICY: ClassVar[str] = "MlpLstmPolicy"
@@ -110,18 +110,8 @@ class RL2(OnPolicyRival, RecurrentPPO):
     ) -> None:
         self.n_episodes_per_trial = n_episodes_per_trial
         self.n_trials_per_rollout = n_trials_per_rollout
-        self._check_trials()
-        seed = self._check_settings(policy, seed, kwargs)
-        if isinstance(env, str):
-            env = make_task_vec_env(env, N_ENVS, seed)
-        if env is not None:
-            env = self._in_trials(self._wrap_env(env), n_episodes_per_trial)
-            # Gradients go through a minibatch, in the order of its steps, and no further
-            kwargs.setdefault("batch_size", N_TRIALS_PER_BATCH * env.max_trial_steps)
-            # What the first episodes find out is worth what the last ones return
-            kwargs.setdefault("gamma", 1 - 1 / env.max_trial_steps)
-        # What a rival checks was checked
-        RecurrentPPO.__init__(self, policy, env, seed=seed, **kwargs)  # type: ignore[arg-type]
+        # Two that follow from the length of a trial, where there is an env
+        super().__init__(policy, env, seed, **{"batch_size": None, "gamma": None, **kwargs})
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
@@ -135,16 +125,29 @@ class RL2(OnPolicyRival, RecurrentPPO):
         assert isinstance(env, TrialVecEnv)
         return TrialVecEnv(env.venv, n_episodes)
 
-    def _check_trials(self) -> None:
-        check_numbers(n_episodes_per_trial=(self.n_episodes_per_trial, 1), n_trials_per_rollout=(self.n_trials_per_rollout, 1))
-
     def _setup_model(self) -> None:
-        # Of the file, or given to load
-        self._check_trials()
+        # Not in the constructor, as they can be given to load, too
+        check_numbers(n_episodes_per_trial=(self.n_episodes_per_trial, 1), n_trials_per_rollout=(self.n_trials_per_rollout, 1))
         if self.env is not None:
             self.n_steps = self._n_steps_in(self.env)
+            n_trial_steps = self.n_steps // self.n_trials_per_rollout
+            # Gradients go through a minibatch, in the order of its steps, and no further
+            self.batch_size = N_TRIALS_PER_BATCH * n_trial_steps if self.batch_size is None else self.batch_size
+            # What the first episodes find out is worth what the last ones return
+            self.gamma = 1 - 1 / n_trial_steps if self.gamma is None else self.gamma
         super()._setup_model()
+        self._check_minibatches()
         self._set_trials()
+
+    def _check_minibatches(self) -> None:
+        # The library's PPO minds it, and its recurrent one does not
+        n_steps = self.n_steps * self.n_envs
+        batch_size = self.batch_size or n_steps
+        if self.normalize_advantage and 1 in (batch_size, n_steps % batch_size):
+            raise ValueError(
+                f"batch_size is {batch_size}, and a rollout has {n_steps} steps, so that a minibatch would have one, whose "
+                "advantage cannot be normalized: give a divisor of the steps above 1."
+            )
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """

@@ -13,7 +13,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, GymEnv
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her import HerReplayBuffer
-from stable_baselines3.her.goal_selection_strategy import KEY_TO_GOAL_STRATEGY
+from stable_baselines3.her.goal_selection_strategy import KEY_TO_GOAL_STRATEGY, GoalSelectionStrategy
 from stable_baselines3.sac import SAC
 from stable_baselines3.sac.policies import MultiInputPolicy, SACPolicy
 
@@ -28,10 +28,10 @@ from sb3_htr.rivals.adaptation import ToldAdaptation
 from sb3_htr.rivals.off_policy import OffPolicyRival
 from sb3_htr.rivals.shown_task import ShownTaskVecEnv
 
-# Arguments of the replay buffer that are the model's
+# Arguments of the replay buffer that are the model's; rewards here are not of infos
 GIVEN_BY_MODEL = (
     *("buffer_size", "observation_space", "action_space", "env", "device", "n_envs"),
-    *("optimize_memory_usage", "handle_timeout_termination"),
+    *("optimize_memory_usage", "handle_timeout_termination", "copy_info_dict"),
 )
 
 
@@ -130,6 +130,7 @@ class SACHER(OffPolicyRival, SAC):
         **OffPolicyRival.FOLLOWS,
         "replay_buffer_class": "replay is HER's",
         "optimize_memory_usage": "HER's replay does without",
+        "n_steps": "HER's replay has returns of one step",
     }
 
     def __init__(
@@ -167,7 +168,7 @@ class SACHER(OffPolicyRival, SAC):
         check_keywords("replay_buffer_kwargs", replay, HerReplayBuffer, without=GIVEN_BY_MODEL)
         check_numbers(n_sampled_goal=(replay.get("n_sampled_goal", 4), 0))
         strategy = replay.get("goal_selection_strategy", "future")
-        if isinstance(strategy, str) and strategy.lower() not in KEY_TO_GOAL_STRATEGY:
+        if not isinstance(strategy, GoalSelectionStrategy) and str(strategy).lower() not in KEY_TO_GOAL_STRATEGY:
             raise ValueError(f"goal_selection_strategy is {strategy!r}, expected one of {sorted(KEY_TO_GOAL_STRATEGY)}.")
         if self.env is None:
             # Loaded for prediction only: SB3 wants a buffer, we want no memory of it

@@ -7,7 +7,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_htr.common.checks import check_spaces, get_max_episode_steps, get_task_family
+from sb3_htr.common.checks import check_spaces, get_task_family
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.vec_env import set_tasks
 from sb3_htr.common.vec_wrappers import CopiedWrapper
@@ -57,6 +57,7 @@ class TrialVecEnv(CopiedWrapper):
 
     :param venv: env of a task family
     :param n_episodes: episodes of a trial
+    :raises ValueError: for a number below 1, or an env that has no tasks, or other observations and actions than vectors
     """
 
     def __init__(self, venv: VecEnv, n_episodes: int) -> None:
@@ -72,11 +73,6 @@ class TrialVecEnv(CopiedWrapper):
         self.n_episodes = n_episodes
         self._episode = np.zeros(self.num_envs, dtype=np.int64)
         self._last = LastStep(self.num_envs, action_dim)
-
-    @property
-    def max_trial_steps(self) -> int:
-        """Steps of a trial, at most."""
-        return self.n_episodes * get_max_episode_steps(self.venv)
 
     def reset(self) -> VecEnvObs:
         """Begin a trial in each env."""

@@ -39,8 +39,8 @@ USAGE = (
 )
 # Packages that the base installation does not bring, and the extra that does
 EXTRAS = {
-    **dict.fromkeys(("rl_zoo3", "optuna", "sqlalchemy", "yaml", "huggingface_hub", "filelock"), "zoo"),
-    **dict.fromkeys(("matplotlib", "rliable", "pandas", "scipy"), "plots"),
+    **dict.fromkeys(("rl_zoo3", "optuna", "sqlalchemy", "yaml", "huggingface_hub", "filelock", "sb3_contrib"), "zoo"),
+    **dict.fromkeys(("matplotlib", "rliable", "pandas", "scipy"), "zoo"),
     "PIL": "video",
     "pygame": "video",
     "imageio_ffmpeg": "video",
@@ -48,7 +48,6 @@ EXTRAS = {
     "gymnasium_robotics": "robotics",
     "panda_gym": "panda",
     "metaworld": "metaworld",
-    "sb3_contrib": "zoo",
     "tensorboard": "tensorboard",
     "psycopg": "postgresql",
     "ray": "ray",
@@ -81,15 +80,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         importlib.import_module(MODULES[command]).main(rest)
     except ModuleNotFoundError as error:
-        package = (error.name or "").split(".")[0]
+        package, *inside = (error.name or "").split(".")
         if package in rest:
             raise ImportError(f"The module {package} is not found: install it, or add its folder to PYTHONPATH.") from None
         if package not in EXTRAS:
             raise
-        print(
-            f"sb3-htr {command} needs {package}, which is not installed: pip install 'sb3_htr[{EXTRAS[package]}]'",
-            file=sys.stderr,
-        )
+        missing = f"{error.name}, which another version of {package} has" if inside else f"{package}, which is not installed"
+        update = "--upgrade " if inside else ""
+        print(f"sb3-htr {command} needs {missing}: pip install {update}'sb3_htr[{EXTRAS[package]}]'", file=sys.stderr)
         return 1
     return 0
 

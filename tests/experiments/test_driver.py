@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from sb3_htr.common.divergence import DivergedError
 from sb3_htr.experiments import driver as driver_module
 from sb3_htr.experiments import executors
 from sb3_htr.experiments.cell import Cell
@@ -24,7 +25,6 @@ from sb3_htr.experiments.executors import Processes, SerialExecutor
 from sb3_htr.experiments.grid import EXPERIMENTS, Experiment, Variant
 from sb3_htr.experiments.runner import lock_of, run_cell
 from sb3_htr.experiments.storage.folder import SharedFolder
-from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.zoo.cli import main
 
 CELLS = Experiment("toy", "", "SparsePointRobot-v0", 1000, (Variant("htr-ser"), Variant("htr-ec", "K = 0.8")), 3).cells()

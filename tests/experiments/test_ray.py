@@ -15,12 +15,12 @@ import pytest
 import torch as th
 
 from helpers.runs import OF_CELL
+from sb3_htr.common.divergence import DivergedError
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.driver import Driver
 from sb3_htr.experiments.executors import HOPELESS, Ray, SerialExecutor
 from sb3_htr.experiments.grid import Experiment, Variant, by
 from sb3_htr.experiments.runner import find_finished, run_cell
-from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.zoo.run.record import RECORD
 
 SLOWER = {**OF_CELL, "gradient_steps": 20}

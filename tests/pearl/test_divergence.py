@@ -7,8 +7,9 @@ import pytest
 import torch as th
 
 from helpers import ROLLOUT, MakePEARL
+from sb3_htr.common.divergence import DivergedError
 from sb3_htr.common.warn_once import WarnOnce
-from sb3_htr.pearl.divergence import DivergedError, check_posterior
+from sb3_htr.pearl.divergence import check_posterior
 
 
 def test_a_diverging_loss_stops_training_with_step_and_tensor(tiny_pearl: MakePEARL) -> None:

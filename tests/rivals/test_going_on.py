@@ -18,10 +18,14 @@ from sb3_htr.rivals.sac_her import SACHER
 ROLLOUT = 2 * 40
 
 
-def rl2() -> RL2:
-    nets = {"lstm_hidden_size": 4, "net_arch": [4]}
+def rl2(**policy_kwargs: Any) -> RL2:
+    nets = {"lstm_hidden_size": 4, "net_arch": [4], **policy_kwargs}
     env = make_task_vec_env(ENV_ID, 2, seed=0)
     return RL2("MlpLstmPolicy", env, 2, n_trials_per_rollout=1, n_epochs=1, seed=0, policy_kwargs=nets)
+
+
+def rl2_on_one_scale() -> RL2:
+    return rl2(normalize_observations=True)
 
 
 def sac_her(learning_starts: int = 0) -> SACHER:
@@ -35,7 +39,7 @@ def with_random_actions() -> SACHER:
     return sac_her(3 * ROLLOUT)
 
 
-@pytest.mark.parametrize("make", [rl2, sac_her, with_random_actions])
+@pytest.mark.parametrize("make", [rl2, rl2_on_one_scale, sac_her, with_random_actions])
 def test_it_goes_on_exactly(make: Callable[[], Any]) -> None:
     # One at a time: they share the global generators
     unbroken = make().learn(4 * ROLLOUT)
@@ -46,6 +50,20 @@ def test_it_goes_on_exactly(make: Callable[[], Any]) -> None:
     assert second.num_timesteps == unbroken.num_timesteps and second._n_updates == unbroken._n_updates
     for name, value in unbroken.policy.state_dict().items():
         assert th.equal(value, second.policy.state_dict()[name]), name
+
+
+@pytest.mark.parametrize("make", [rl2_on_one_scale, sac_her])
+def test_what_came_after_a_state_is_forgotten_with_it(make: Callable[[], Any]) -> None:
+    used = make().learn(ROLLOUT)
+    state = used.state_dict()
+    used.learn(3 * ROLLOUT, reset_num_timesteps=False)
+    weights = []
+    for model in (used, make()):
+        model.load_state_dict(state)
+        model.learn(2 * ROLLOUT, reset_num_timesteps=False)
+        weights.append(model.policy.state_dict())
+    for name, value in weights[0].items():
+        assert th.equal(value, weights[1][name]), name
 
 
 @pytest.mark.parametrize("make", [rl2, sac_her])

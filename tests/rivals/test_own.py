@@ -227,10 +227,14 @@ class OwnSAC(OffPolicyRival, SAC):
     _adaptation = OwnTD3._adaptation
 
 
-def test_settings_that_were_given_stay_as_they_are() -> None:
+@pytest.mark.parametrize("kind", [OwnSAC, RL2])
+def test_settings_that_were_given_stay_as_they_are(kind: Any, tmp_path: Path) -> None:
     given: dict[str, Any] = {"net_arch": [4]}
-    OwnSAC("MlpPolicy", ENV_ID, policy_kwargs=given)
+    model = kind(kind.DEFAULT_POLICY, ENV_ID, policy_kwargs=given)
     assert given == {"net_arch": [4]}
+    given["net_arch"] = [8]
+    model.save(tmp_path / "model")
+    assert kind.load(tmp_path / "model").policy_kwargs["net_arch"] == [4]
 
 
 def test_actions_that_are_not_scaled_are_refused(registered: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,12 +9,14 @@ import pytest
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+from stable_baselines3.her import GoalSelectionStrategy
 
 from helpers import ENV_ID
 from sb3_htr import evaluate_adaptation
 from sb3_htr.adaptation.adaptation import Step
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
 from sb3_htr.common.checks import get_task_family
+from sb3_htr.common.divergence import DivergedError
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.rivals.rl2 import RL2
 from sb3_htr.rivals.sac_her import SACHER
@@ -44,6 +46,9 @@ def small(kind: Any, env: Any = None, **settings: Any) -> Any:
         ({"learning_rate": -1e-3}, "learning_rate is -0.001, expected a number of at least 0"),
         ({"ent_coef": -1.0}, "ent_coef is -1.0, expected a number of at least 0"),
         ({"batch_size": 0}, "batch_size is 0, expected a whole number of at least 1"),
+        ({"sde_sample_freq": 4}, "has no setting 'sde_sample_freq': it is of use_sde"),
+        ({"policy_kwargs": {"net_arch": "x"}}, r"net_arch is 'x', expected the hidden units of each layer"),
+        ({"policy_kwargs": {"net_arch": {"pi": [8], "qf": [8, 0]}}}, r"qf is \[8, 0\], expected the hidden units"),
     ],
 )
 def test_settings(kind: Any, settings: dict[str, Any], message: str) -> None:
@@ -57,6 +62,11 @@ def test_settings(kind: Any, settings: dict[str, Any], message: str) -> None:
         (RL2, {"gamma": 7.0}, "gamma is 7.0, expected a number from 0 to 1"),
         (RL2, {"n_episodes_per_trial": -3}, "n_episodes_per_trial is -3, expected a whole number of at least 1"),
         (RL2, {"n_trials_per_rollout": 0}, "n_trials_per_rollout is 0, expected a whole number of at least 1"),
+        (RL2, {"batch_size": 1}, "batch_size is 1, and a rollout has 200 steps"),
+        (RL2, {"clip_range_vf": 0.0}, r"clip_range_vf is 0\.0, which keeps networks from learning: expected a number above 0"),
+        (RL2, {"target_kl": -1}, "target_kl is -1, expected a number of at least 0"),
+        (RL2, {"target_kl": 0}, "target_kl is 0, which keeps networks from learning"),
+        (SACHER, {"tau": 0}, "tau is 0, which keeps networks from learning"),
         (SACHER, {"gamma": 7.0}, "gamma is 7.0, expected a number from 0 to 1"),
         (SACHER, {"buffer_size": 0}, "buffer_size is 0, expected a whole number of at least 1"),
         (SACHER, {"gradient_steps": -2}, "gradient_steps is -2, expected a whole number of at least -1"),
@@ -70,7 +80,29 @@ def test_settings_that_load_is_given(kind: Any, settings: dict[str, Any], messag
             kind.load(tmp_path / "model", env=env, **settings)
 
 
-@pytest.mark.parametrize("name", ["train_freq", "optimize_memory_usage", "replay_buffer_class"])
+@pytest.mark.parametrize(
+    ("kind", "settings", "message"),
+    [
+        (RL2, {"target_kl": "x"}, "target_kl is 'x', expected a number"),
+        (RL2, {"ent_coef": "auto"}, "ent_coef is 'auto', expected a number"),
+        (RL2, {"policy_kwargs": {"lstm_hidden_size": -1}}, "lstm_hidden_size is -1, expected a whole number of at least 1"),
+        (RL2, {"policy_kwargs": {"n_lstm_layers": 0}}, "n_lstm_layers is 0, expected a whole number of at least 1"),
+        (SACHER, {"policy_kwargs": {"n_critics": 0}}, "n_critics is 0, expected a whole number of at least 1"),
+        (SACHER, {"ent_coef": "1e-3"}, "ent_coef is '1e-3', expected a number"),
+        (SACHER, {"target_entropy": "x"}, "target_entropy is 'x', expected a number"),
+    ],
+)
+def test_settings_of_one(kind: Any, settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        kind(kind.DEFAULT_POLICY, ENV_ID, **settings)
+
+
+def test_an_entropy_coefficient_may_be_learnt() -> None:
+    model = small(SACHER, ent_coef="auto_0.1", target_entropy="auto")
+    assert model.target_entropy == -2 and model.log_ent_coef.exp().item() == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("name", ["train_freq", "optimize_memory_usage", "replay_buffer_class", "n_steps"])
 def test_what_follows_is_no_setting(name: str, tmp_path: Path) -> None:
     given: dict[str, Any] = {name: True}
     with pytest.raises(ValueError, match=f"SACHER has no setting '{name}': .*(episode of each env|HER's)"):
@@ -197,9 +229,30 @@ def test_nor_is_the_last_observation_of_an_episode(kind: Any) -> None:
         model.learn(400)
 
 
+class Spoils(BaseCallback):
+    """A weight, where a rollout ends."""
+
+    def _on_rollout_end(self) -> None:
+        next(self.model.policy.parameters()).data.view(-1)[0] = np.nan
+
+    def _on_step(self) -> bool:
+        return True
+
+
+@RIVALS
+def test_networks_that_diverged_end_the_training(kind: Any) -> None:
+    model = small(kind, **{RL2: {"n_episodes_per_trial": 1}, SACHER: {"learning_starts": 0}}[kind])
+    with pytest.raises(DivergedError, match=r"The weights .* are not finite at env step 40, update \d+: lower learning_rate"):
+        model.learn(400, Spoils())
+
+
 def test_settings_of_her() -> None:
-    with pytest.raises(ValueError, match="goal_selection_strategy is 'futur', expected one of"):
-        SACHER("MultiInputPolicy", ENV_ID, replay_buffer_kwargs={"goal_selection_strategy": "futur"})
+    for strategy in ("futur", 3):
+        with pytest.raises(ValueError, match=f"goal_selection_strategy is {strategy!r}, expected one of"):
+            SACHER("MultiInputPolicy", ENV_ID, replay_buffer_kwargs={"goal_selection_strategy": strategy})
+    small(SACHER, replay_buffer_kwargs={"goal_selection_strategy": GoalSelectionStrategy.FINAL})
+    with pytest.raises(ValueError, match="replay_buffer_kwargs has no setting 'copy_info_dict'"):
+        SACHER("MultiInputPolicy", ENV_ID, replay_buffer_kwargs={"copy_info_dict": True})
     with pytest.raises(ValueError, match="n_sampled_goal is -1, expected a whole number of at least 0"):
         SACHER("MultiInputPolicy", ENV_ID, replay_buffer_kwargs={"n_sampled_goal": -1})
     with pytest.raises(ValueError, match="replay_buffer_kwargs has no setting 'n_sampled': did you mean n_sampled_goal"):

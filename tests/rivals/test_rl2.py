@@ -183,6 +183,8 @@ def test_it_sees_observations_on_one_scale_and_rewards_as_they_are(tmp_path: Any
         ({"n_trials_per_rollout": 0}, "n_trials_per_rollout is 0, expected a whole number of at least 1"),
         ({"n_steps": 128}, "RL2 has no setting 'n_steps': it follows from n_trials_per_rollout"),
         ({"env": "Pendulum-v1"}, "no task_family"),
+        ({"batch_size": 79}, "batch_size is 79, and a rollout has 80 steps, so that a minibatch would have one, whose adv"),
+        ({"batch_size": 1}, "batch_size is 1, and a rollout has 80 steps"),
         ({"policy_kwargs": {"normalize_observations": "yes"}}, "normalize_observations is 'yes', expected True or False"),
         (
             {"policy_kwargs": {"normalize_observations": True, "features_extractor_class": CombinedExtractor}},
@@ -193,6 +195,10 @@ def test_it_sees_observations_on_one_scale_and_rewards_as_they_are(tmp_path: Any
 def test_bad_settings_are_refused(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         tiny_rl2(**settings)
+
+
+def test_a_minibatch_of_one_step_is_fine_where_advantages_stay_as_they_are() -> None:
+    assert tiny_rl2(batch_size=79, normalize_advantage=False).learn(160).num_timesteps == 160
 
 
 def test_it_has_no_explorers() -> None:

@@ -221,6 +221,22 @@ def test_a_replay_that_began_anew_is_saved_whole() -> None:
     np.testing.assert_array_equal(theirs._current_ep_start, ours._current_ep_start)
 
 
+@pytest.mark.parametrize(
+    ("n_steps", "n_envs", "buffer_size", "message"),
+    [
+        (160, 4, 80, "has 40 steps of each of 4 envs, and the buffer is of 20 of each of 4: .*buffer_size"),
+        (240, 4, 400, "has 50 steps of each of 4 envs, and the buffer is of 100 of each of 4"),  # it has begun anew
+        (80, 1, 50, "has 20 steps of each of 4 envs, and the buffer is of 50 of each of 1: .*as many envs"),
+    ],
+)
+def test_a_replay_of_another_size_is_refused(n_steps: int, n_envs: int, buffer_size: int, message: str) -> None:
+    state = tiny_sac_her(buffer_size=200).learn(n_steps).state_dict()
+    model = tiny_sac_her(make_task_vec_env(ENV_ID, n_envs, seed=0), buffer_size=buffer_size)
+    with pytest.raises(ValueError, match=message):
+        model.load_state_dict(state)
+    assert model.num_timesteps == 0, "nothing was taken"
+
+
 def test_a_rollout_that_ends_within_an_episode_ends_it_in_the_replay() -> None:
     env = BatchedTaskVecEnv(DynamicsVectorEnv(PointRobotFamily(), FallingDynamics(4), max_episode_steps=20))
     replay = tiny_sac_her(env).learn(480).replay_buffer

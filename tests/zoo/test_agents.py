@@ -385,7 +385,7 @@ def test_a_run_behind_the_modules_is_no_module(run: Path, tmp_path: Path, monkey
 
 @pytest.mark.parametrize(
     ("command", "package", "extra"),
-    [("train", "rl_zoo3", "zoo"), ("record", "imageio_ffmpeg", "video"), ("plot", "matplotlib", "plots")],
+    [("train", "rl_zoo3", "zoo"), ("record", "imageio_ffmpeg", "video"), ("plot", "matplotlib", "zoo")],
 )
 def test_missing_extras_are_named_with_the_pip_command(
     command: str, package: str, extra: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -397,6 +397,19 @@ def test_missing_extras_are_named_with_the_pip_command(
     monkeypatch.setitem(sys.modules, package, None)
     assert main([command, "--env", ENV_ID]) == 1
     assert f"needs {package}, which is not installed: pip install 'sb3_htr[{extra}]'" in capsys.readouterr().err
+
+
+def test_a_package_that_is_too_old_is_not_said_to_be_missing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It was, with a command that installs nothing, as the package is there."""
+    monkeypatch.setattr(sb3_htr, "zoo", sb3_htr.zoo)
+    for name in [name for name in sys.modules if name.startswith("sb3_htr.zoo") and name != "sb3_htr.zoo.cli"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "optuna.storages.journal", None)
+    assert main(["train", "--env", ENV_ID]) == 1
+    said = capsys.readouterr().err
+    assert "needs optuna.storages.journal, which another version of optuna has: pip install --upgrade 'sb3_htr[zoo]'" in said
 
 
 def test_every_package_that_a_command_may_miss_has_its_extra() -> None:

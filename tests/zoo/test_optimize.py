@@ -22,7 +22,7 @@ import yaml
 from helpers import ENV_ID, TINY
 from helpers.runs import run_folder
 from sb3_htr import PEARL
-from sb3_htr.pearl.divergence import DivergedError
+from sb3_htr.common.divergence import DivergedError
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.commands import optimize, train
 from sb3_htr.zoo.run import search_space

@@ -23,8 +23,8 @@ from helpers import ENV_ID, TINY
 from helpers.runs import run_folder, train_arguments
 from sb3_htr import PEARL
 from sb3_htr.adaptation.evaluation import AdaptationRecord
+from sb3_htr.common.divergence import DivergedError
 from sb3_htr.common.vec_env import make_task_vec_env
-from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.commands.evaluate import table
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback

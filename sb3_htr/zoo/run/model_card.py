@@ -210,7 +210,7 @@ has not seen, with mean actions.{of_explorers}
 ## Use
 
 ```console
-$ pip install '.[zoo,video]'  # in a checkout of sb3_htr
+$ pip install '.[zoo,video]'  # in a checkout of sb3_htr; and the extra of the env, as mujoco
 $ {watch}
 ```
 

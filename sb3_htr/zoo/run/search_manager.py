@@ -9,7 +9,7 @@ import optuna
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_htr.pearl.divergence import DivergedError
+from sb3_htr.common.divergence import DivergedError
 from sb3_htr.zoo.run.manager import MetaExperimentManager
 from sb3_htr.zoo.run.method import merged, names_of
 from sb3_htr.zoo.run.study import check_is_of

@@ -14,10 +14,10 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.common.checkpoint import checkpoints, load_latest
 from sb3_htr.common.checkpoint_callback import CheckpointCallback, cut_monitor_files
+from sb3_htr.common.divergence import DivergedError
 from sb3_htr.common.errors import reason
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.common.versions import hardware, made_by
-from sb3_htr.pearl.divergence import DivergedError
 from sb3_htr.zoo.run.callbacks import ProgressCallback
 from sb3_htr.zoo.run.folder import SystemLock, claim, lock
 from sb3_htr.zoo.run.manager import MetaExperimentManager
