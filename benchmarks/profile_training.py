@@ -62,6 +62,7 @@ def main() -> None:
         shares[name] += event.self_cpu_time_total
     total = sum(shares.values())
     rows = sorted(((round(share / total, 4), name) for name, share in shares.items()), reverse=True)
+    rows.append((round(sum(share for share, _ in rows if share < 0.01), 4), "all else"))
     write_content("profile_training", {"shares": [{"name": name, "share": share} for share, name in rows if share >= 0.01]})
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
-from _common import Figure, by_turns, faster, seconds, write
+from _common import Figure, by_turns, faster, look_at_all, seconds, write
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.her import HerReplayBuffer
@@ -63,11 +63,15 @@ def filled(capacity: int) -> tuple[MultiTaskReplayBuffer, HerReplayBuffer]:
 
 
 def main() -> None:
-    """Batches of about as many rows, of which K are relabelled: ours are contexts of 20 and RL batches of 16 rows a task."""
+    """
+    Batches of about as many rows, of which K are relabelled: ours are contexts of 20 and RL batches of 16 rows a task. What
+    ours asks of a step once, when it is first drawn, was asked before.
+    """
     th.set_num_threads(1)
     figures = []
     for capacity in (10_000, 100_000, 1_000_000):
         ours, her = filled(capacity)
+        look_at_all(ours)
         for batch in (256, 4096):
             n_tasks = round(batch / 36)
             draw = partial(ours.sample, 16, meta_batch_size=n_tasks, context_size=20)

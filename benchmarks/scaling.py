@@ -10,7 +10,7 @@ import gymnasium as gym
 import matplotlib.pyplot as plt
 import numpy as np
 import torch as th
-from _common import Figure, write
+from _common import Figure, by_turns, look_at_all, write
 from gymnasium import spaces
 
 from htr_envs.dynamics import Dynamics, DynamicsVectorEnv
@@ -18,6 +18,7 @@ from htr_envs.point_robot import PointRobotFamily
 from sb3_htr import PEARL
 from sb3_htr.adaptation.evaluation import evaluate_adaptation
 from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.pearl.pearl import N_LABELLED
 from sb3_htr.zoo.plots.curves import finish
 from sb3_htr.zoo.plots.style import COLOURS
 
@@ -25,8 +26,8 @@ ENV_ID = "Scaling-v0"
 PICTURE = Path(__file__).parents[1] / "docs" / "cost.svg"
 # How many of each a millisecond is
 PER_MS = {"ms": 1.0, "microseconds": 1000.0}
-# Seconds that a point takes, about, after its set-up
-PATIENCE = 0.5
+# Seconds that a point takes in each round, at least
+PATIENCE = 0.05
 
 
 class WalkDynamics(Dynamics[PointRobotFamily]):
@@ -92,37 +93,44 @@ def fill(model: PEARL, n_transitions: int, horizon: int = 20) -> None:
 
 def milliseconds(function: Callable[[], Any]) -> float:
     """
-    :param function: what is timed; called once before
+    :param function: what is timed
     :return: the median duration of a call, of the process: what else the machine does is left out
     """
-    function()
     durations: list[float] = []
-    while len(durations) < 3 or (sum(durations) < PATIENCE and len(durations) < 100):
+    while sum(durations) < PATIENCE:
         start = time.process_time()
         function()
         durations.append(time.process_time() - start)
     return 1e3 * float(np.median(durations))
 
 
-def first_look(model: PEARL) -> float:
+# Each prepares a cost, and returns what measures it once
+Cost = Callable[[PEARL], Callable[[], float]]
+
+
+def first_look(model: PEARL) -> Callable[[], float]:
     """Of what relabelling asks of a step once, when it is first drawn, in microseconds."""
     assert model.replay_buffer is not None
-    episodes, cache = model.replay_buffer.episodes, model.replay_buffer.relabeller._demerits  # type: ignore[attr-defined]
-    parts = np.array_split(episodes.index().rows, len(episodes.index().rows) // 1000)
-    return 1e3 * float(np.median([milliseconds(partial(cache._ask, part)) for part in parts[:3]])) / len(parts[0])
+    cache = model.replay_buffer.relabeller._demerits  # type: ignore[attr-defined]
+    rows = model.replay_buffer.episodes.index().rows[:1000]
+    return lambda: 1e3 * milliseconds(partial(cache._ask, rows)) / len(rows)
 
 
-def draw(model: PEARL) -> float:
-    """Of one meta-batch, from steps that were looked at before."""
+def draw(model: PEARL) -> Callable[[], float]:
+    """Of one meta-batch as a training draws it, from steps that were looked at before."""
     assert model.replay_buffer is not None
-    cache, episodes = model.replay_buffer.relabeller._demerits, model.replay_buffer.episodes  # type: ignore[attr-defined]
-    for part in np.array_split(episodes.index().rows, len(episodes.index().rows) // 1000):
-        cache.look_up(episodes, part)
-    sizes = {"meta_batch_size": model.meta_batch_size, "context_size": model.context_size}
-    return milliseconds(partial(model.replay_buffer.sample, model.batch_size, **sizes))
+    look_at_all(model.replay_buffer)
+    sizes = {"meta_batch_size": model.meta_batch_size, "context_size": model.context_size, "n_labelled": N_LABELLED}
+    return partial(milliseconds, partial(model.replay_buffer.sample, model.batch_size, **sizes))
 
 
-def index(model: PEARL) -> float:
+def log(model: PEARL) -> Callable[[], float]:
+    """Of what is logged of the replay, once after each rollout."""
+    assert model.replay_buffer is not None
+    return partial(milliseconds, model.replay_buffer.stats)
+
+
+def index(model: PEARL) -> Callable[[], float]:
     """Of the index of what is stored, once after each rollout."""
     episodes = model.replay_buffer.episodes  # type: ignore[union-attr]
 
@@ -130,25 +138,25 @@ def index(model: PEARL) -> float:
         episodes._index = None
         episodes.index()
 
-    return milliseconds(rebuild)
+    return partial(milliseconds, rebuild)
 
 
-def update(model: PEARL) -> float:
+def update(model: PEARL) -> Callable[[], float]:
     """Of one update."""
-    return milliseconds(partial(model._update, model.batch_size))
+    return partial(milliseconds, partial(model._update, model.batch_size))
 
 
-def collect(model: PEARL) -> float:
+def collect(model: PEARL) -> Callable[[], float]:
     """Of an env step, in microseconds."""
     assert model.env is not None and model.replay_buffer is not None
     model.learning_starts = 0
     callback = model._init_callback(None)
     n_steps = model.n_envs * model.n_episodes_per_task * model.replay_buffer.max_episode_steps
     rollout = partial(model.collect_rollouts, model.env, callback, model.train_freq, model.replay_buffer)  # type: ignore[arg-type]
-    return 1e3 * milliseconds(rollout) / n_steps
+    return lambda: 1e3 * milliseconds(rollout) / n_steps
 
 
-def bank(model: PEARL) -> float:
+def bank(model: PEARL) -> Callable[[], float]:
     """Of what the task bank does with an episode."""
     assert model.task_bank is not None and model.replay_buffer is not None
     episodes = list(model.replay_buffer.episodes._data[:100])
@@ -157,14 +165,25 @@ def bank(model: PEARL) -> float:
         model.task_bank.new = [(0, episode) for episode in episodes]  # type: ignore[union-attr]
         model.task_bank.update()  # type: ignore[union-attr]
 
-    return milliseconds(update) / len(episodes)
+    return lambda: milliseconds(update) / len(episodes)
 
 
-def adapt(model: PEARL, n_tasks: int) -> float:
+def adapt(model: PEARL, n_tasks: int) -> Callable[[], float]:
     """Of an env step of one task, in microseconds, in adaptations of two episodes."""
     envs = make_task_vec_env(ENV_ID, n_tasks, seed=0)
     tasks = PointRobotFamily(n_test_tasks=n_tasks).test_tasks
-    return 1e3 * milliseconds(lambda: evaluate_adaptation(model, envs, tasks, n_episodes=2)) / (n_tasks * 2 * 20)
+    adaptation = partial(evaluate_adaptation, model, envs, tasks, n_episodes=2)
+    return lambda: 1e3 * milliseconds(adaptation) / (n_tasks * 2 * 20)
+
+
+def at_each(sizes: list[int], costs: list[Callable[[], float]]) -> list[float]:
+    """
+    :param sizes: of what grows
+    :param costs: a cost at each of them
+    :return: its medians, measured by turns
+    """
+    times = by_turns({str(size): cost for size, cost in zip(sizes, costs, strict=True)})
+    return [float(np.median(durations)) for durations in times.values()]
 
 
 Curves = dict[str, tuple[str, list[float]]]
@@ -173,14 +192,12 @@ Curves = dict[str, tuple[str, list[float]]]
 def measure() -> Iterator[tuple[str, list[int], Curves]]:
     """What grows, its sizes, and what is measured at each: unit and values."""
 
-    def curves(sizes: list[int], make: Callable[[int], PEARL], **costs: tuple[str, Callable[[PEARL], float]]) -> Curves:
-        named = ((name.replace("meta_batch", "meta-batch").replace("_", " "), unit) for name, (unit, _) in costs.items())
-        values: Curves = {name: (unit, []) for name, unit in named}
-        for size in sizes:
-            model = make(size)
-            for (_, cost), (_, list_) in zip(costs.values(), values.values(), strict=True):
-                list_.append(cost(model))
-        return values
+    def curves(sizes: list[int], make: Callable[[int], PEARL], **costs: tuple[str, Cost]) -> Curves:
+        models = [make(size) for size in sizes]
+        return {
+            name.replace("meta_batch", "meta-batch").replace("_", " "): (unit, at_each(sizes, [cost(m) for m in models]))
+            for name, (unit, cost) in costs.items()
+        }
 
     def with_tasks(n: int) -> PEARL:
         model = make_model(n_train_tasks=n)
@@ -215,7 +232,8 @@ def measure() -> Iterator[tuple[str, list[int], Curves]]:
         ),
     )
     sizes = [100_000, 1_000_000, 10_000_000]
-    yield "transitions in the replay", sizes, curves(sizes, with_transitions, a_meta_batch=(ms, draw), the_index=(ms, index))
+    costs: dict[str, tuple[str, Cost]] = {"a_meta_batch": (ms, draw), "the_index": (ms, index), "what_is_logged": (ms, log)}
+    yield "transitions in the replay", sizes, curves(sizes, with_transitions, **costs)
     sizes = [20, 50, 200, 1_000]
     costs = {"a_meta_batch": (ms, draw), "an_update": (ms, update), "an_episode_for_the_task_bank": (ms, bank)}
     yield "steps of an episode", sizes, curves(sizes, with_horizon, **costs)
@@ -226,7 +244,7 @@ def measure() -> Iterator[tuple[str, list[int], Curves]]:
     yield "envs", sizes, curves(sizes, make_model, an_env_step=(us, collect))
     sizes = [1, 10, 100, 1_000]
     model = make_model().learn(4_001, log_interval=None)
-    yield "tasks adapted to at once", sizes, {"an env step of a task": (us, [adapt(model, n) for n in sizes])}
+    yield "tasks adapted to at once", sizes, {"an env step of a task": (us, at_each(sizes, [adapt(model, n) for n in sizes]))}
 
 
 def plot(panels: list[tuple[str, list[int], Curves]]) -> None:
@@ -257,7 +275,8 @@ def main() -> None:
             figures.append(
                 Figure(f"{what}, {sizes[-1]:,} {name}", unit, values[-1], values[0], values[0] / values[-1], None, against)
             )
-    write("scaling", figures)
+    points = [{"grows": name, "sizes": sizes, "costs": curves} for name, sizes, curves in panels]
+    write("scaling", figures, points=points)
     plot(panels)
 
 

@@ -20,7 +20,7 @@ def table(content: dict[str, Any]) -> str:
     """
     lines: list[list[str]] = []
     for row in content["rows"]:
-        ratio, goal = (f"{row[key]:.2f}" if row[key] else "" for key in ("ratio", "goal"))
+        ratio, goal = (_ratio(row[key]) if row[key] else "" for key in ("ratio", "goal"))
         ours, reference = (f"{row[key]:,.{_decimals(row[key])}f}" if row[key] else "" for key in ("ours", "reference"))
         lines.append([row["name"], f"{ours} {row['unit']}", reference, ratio, goal, row["against"]])
     text = markdown_table(["what", "ours", "alternative", "ratio", "goal", "against"], lines)
@@ -54,11 +54,15 @@ def shares(content: dict[str, Any]) -> str:
     :return: Markdown table
     """
     lines = [[row["name"].removeprefix("aten::"), f"{row['share']:.1%}"] for row in content["shares"]]
-    return f"{markdown_table(['part', 'share of wall time'], lines)}\n\n{_origin(content)}\n"
+    return f"{markdown_table(['part', 'share of CPU time'], lines)}\n\n{_origin(content)}\n"
 
 
 def _origin(content: dict[str, Any]) -> str:
     return f"`{content['command']}`, {content['date']}, commit {content['commit']}, {content['machine']}."
+
+
+def _ratio(value: float) -> str:
+    return f"{value:.2f}" if value >= 0.1 else f"{value:.1g}"
 
 
 def _decimals(value: float) -> int:

@@ -155,8 +155,8 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         index, columns = episodes.index(), self.transitions
         if len(index.rows) == 0:
             return np.zeros(0, dtype=bool)
-        reward, task_free = (episodes.rows[index.rows, column] for column in (columns.reward, columns.task_free_reward))
-        return np.logical_or.reduceat(np.abs(reward - task_free) > ROUNDING, index.episode_row[:-1])
+        rewarded = np.abs(episodes.rows[:, columns.reward] - episodes.rows[:, columns.task_free_reward]) > ROUNDING
+        return np.logical_or.reduceat(rewarded[index.rows], index.episode_row[:-1])
 
     def stats(self) -> dict[str, float]:
         """
