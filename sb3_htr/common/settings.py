@@ -2,6 +2,7 @@
 
 import difflib
 import inspect
+import re
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar, cast
@@ -11,6 +12,8 @@ import numpy as np
 Kind = TypeVar("Kind")
 # Of a number that may be as small as it likes
 LOWEST = -sys.float_info.max
+# What SB3 reads as an entropy coefficient that is learnt, with a first value above 0
+LEARNT_ENT_COEF = r"auto(_(?=[^e]*[1-9])\d+(\.\d+)?(e-?\d)?)?"
 VARIADIC = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
 
 
@@ -103,6 +106,25 @@ def check_layers(**networks: Any) -> None:
         whole = isinstance(units, list | tuple) and all(type(plain(n)) is int and n >= 1 for n in units)
         if not whole:
             raise ValueError(f"{name} is {units!r}, expected the hidden units of each layer, as in [128, 128].")
+
+
+def check_entropy(ent_coef: Any, target_entropy: Any) -> None:
+    """
+    SAC's two settings that are a number or a word.
+
+    :param ent_coef: a number, or ``"auto"`` or ``"auto_0.1"``, by which one is learnt
+    :param target_entropy: a number or ``"auto"``
+    :raises ValueError: for anything else
+    """
+    if not isinstance(ent_coef, str):
+        check_numbers(ent_coef=(ent_coef, 0.0))
+    elif not re.fullmatch(LEARNT_ENT_COEF, ent_coef):
+        raise ValueError(
+            f'ent_coef is the text {ent_coef!r}, expected a number, or "auto" or "auto_0.1", by which one is learnt. '
+            "In YAML, 1.0e-3 is a number, and 1e-3 is not."
+        )
+    if not (isinstance(target_entropy, str) and target_entropy == "auto"):
+        check_numbers(target_entropy=(target_entropy, LOWEST))
 
 
 def check_class(name: str, value: Any, base: type) -> None:

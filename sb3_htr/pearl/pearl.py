@@ -1,6 +1,5 @@
 """PEARL: encoder, critics and actor, and how they learn."""
 
-import re
 from typing import Any, ClassVar
 
 import torch as th
@@ -11,7 +10,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from sb3_htr.adaptation.explorers import Explorer
 from sb3_htr.common.divergence import check_not_diverged
 from sb3_htr.common.segments import repeat_segments
-from sb3_htr.common.settings import LOWEST, check_flags, check_numbers
+from sb3_htr.common.settings import check_entropy, check_flags, check_numbers
 from sb3_htr.common.type_aliases import MultiTaskSamples, RewardLabels
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.pearl.divergence import check_posterior
@@ -24,8 +23,6 @@ from sb3_htr.pearl.policies import LatentCritic, MlpPolicy, PEARLPolicy
 
 # By measurement on validation tasks of the Point Robot
 LEARNING_RATE = LinearSchedule(start=1e-3, end=0.0, end_fraction=1.0)
-# What SB3 reads as an entropy coefficient that is learnt, with a first value above 0
-LEARNT_ENT_COEF = r"auto(_(?=[^e]*[1-9])\d+(\.\d+)?(e-?\d)?)?"
 # Transitions of a meta-batch that the reward model learns from, each under all its tasks
 N_LABELLED = 256
 
@@ -187,14 +184,9 @@ class PEARL(OffPolicyMetaAlgorithm):
             kl_coef=(self.kl_coef, 0.0),
             final_kl_coef=(self.kl_coef if self.final_kl_coef is None else self.final_kl_coef, 0.0),
             reward_coef=(self.reward_coef, 0.0),
-            ent_coef=(0.0 if isinstance(self.ent_coef, str) else self.ent_coef, 0.0),
             tau=(self.tau, 0.0, 1.0),
         )
-        if isinstance(self.ent_coef, str) and not re.fullmatch(LEARNT_ENT_COEF, self.ent_coef):
-            raise ValueError(
-                f'ent_coef is the text {self.ent_coef!r}, expected a number, or "auto" or "auto_0.1", by which one is learnt. '
-                "In YAML, 1.0e-3 is a number, and 1e-3 is not."
-            )
+        check_entropy(self.ent_coef, self.target_entropy)
         if self.tau == 0:
             raise ValueError("tau is 0, with which the target critics would never learn: expected a number above 0, up to 1.")
         if self.final_kl_coef is not None and 0 in (self.kl_coef, self.final_kl_coef):
@@ -203,8 +195,6 @@ class PEARL(OffPolicyMetaAlgorithm):
             check_flags(cuda_graph=self.cuda_graph)
         if not callable(self.learning_rate):
             check_numbers(learning_rate=(self.learning_rate, 0.0))
-        if not (isinstance(self.target_entropy, str) and self.target_entropy == "auto"):
-            check_numbers(target_entropy=(self.target_entropy, LOWEST))
         if self.matmul_precision not in PRECISIONS:
             raise ValueError(f"matmul_precision is {self.matmul_precision!r}, expected one of {list(PRECISIONS)}.")
         super()._setup_model()

@@ -15,10 +15,10 @@ from sb3_htr.common.checks import check_is_env, check_recorded_spaces, check_spa
 from sb3_htr.common.errors import OPEN_ERRORS, last_line
 from sb3_htr.common.safe_load import Refused, read_model
 from sb3_htr.common.saving import with_suffix
-from sb3_htr.common.settings import keywords_of
+from sb3_htr.common.settings import LEARNT_ENT_COEF, keywords_of
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.pearl.encoder import ENCODERS
-from sb3_htr.pearl.pearl import LEARNT_ENT_COEF, PEARL
+from sb3_htr.pearl.pearl import PEARL
 from sb3_htr.pearl.policies import PEARLPolicy
 
 # How large networks may be

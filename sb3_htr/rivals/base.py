@@ -27,7 +27,7 @@ from sb3_htr.common.checks import (
 from sb3_htr.common.divergence import check_not_diverged
 from sb3_htr.common.random_state import checked_seed
 from sb3_htr.common.saving import CheckedFiles
-from sb3_htr.common.settings import LOWEST, check_keywords, check_layers, check_numbers
+from sb3_htr.common.settings import check_keywords, check_layers, check_numbers
 from sb3_htr.common.training_state import Resumable
 from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env, set_tasks
 from sb3_htr.common.vec_wrappers import in_float32, seed_envs
@@ -44,7 +44,6 @@ RANGES: dict[str, tuple[float] | tuple[float, float]] = {
     "clip_range_vf": (0.0,),
     "target_kl": (0.0,),
     "ent_coef": (0.0,),
-    "target_entropy": (LOWEST,),
     "vf_coef": (0.0,),
     "max_grad_norm": (0.0,),
     "batch_size": (1,),
@@ -123,8 +122,6 @@ class Rival(CheckedFiles, Resumable):
     POLICY_SIZES: ClassVar[dict[str, int]] = {}
     #: Settings, whole numbers, that an agent which is loaded to act has of its training
     ACTS_BY: ClassVar[tuple[str, ...]] = ()
-    #: Settings that may be ``"auto"``, too
-    MAY_BE_AUTO: ClassVar[tuple[str, ...]] = ()
     FOLLOWS: ClassVar[dict[str, str]] = {
         "use_sde": "its noise is drawn before a rollout, and in no checkpoint",
         "sde_sample_freq": OF_SDE,
@@ -170,9 +167,8 @@ class Rival(CheckedFiles, Resumable):
 
     def _check_ranges(self, settings: dict[str, Any]) -> None:
         for name, value in settings.items():
-            # Schedules, and "auto_0.1", are the library's to read
-            is_auto = name in self.MAY_BE_AUTO and str(value).startswith("auto")
-            if name in RANGES and value is not None and not callable(value) and not is_auto:
+            # Schedules are the library's to read
+            if name in RANGES and value is not None and not callable(value):
                 check_numbers(**{name: (value, *RANGES[name])})
                 if name in ABOVE_ZERO and value == 0:
                     raise ValueError(f"{name} is {value}, which keeps networks from learning: expected a number above 0.")

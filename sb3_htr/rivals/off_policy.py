@@ -11,6 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn, TrainFr
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.common.checks import check_has_env, get_max_episode_steps, warn_without_updates
+from sb3_htr.common.settings import check_entropy
 from sb3_htr.rivals.base import Rival
 
 SelfOffPolicyRival = TypeVar("SelfOffPolicyRival", bound="OffPolicyRival")
@@ -23,12 +24,15 @@ class OffPolicyRival(Rival, OffPolicyAlgorithm):
     """
 
     ACTS_WITH: ClassVar[dict[str, Any]] = {"buffer_size": 1}
-    MAY_BE_AUTO: ClassVar[tuple[str, ...]] = ("ent_coef", "target_entropy")
     FOLLOWS: ClassVar[dict[str, str]] = {
         **Rival.FOLLOWS,
         "train_freq": "a rollout is an episode of each env",
         "optimize_memory_usage": "a replay in a checkpoint does without",
     }
+
+    def _check_ranges(self, settings: dict[str, Any]) -> None:
+        check_entropy(settings.get("ent_coef", 0.0), settings.get("target_entropy", "auto"))
+        super()._check_ranges({name: value for name, value in settings.items() if name != "ent_coef"})
 
     def _setup_model(self) -> None:
         if self.env is not None:
