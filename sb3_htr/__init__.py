@@ -1,14 +1,12 @@
 """Meta-reinforcement learning for Stable-Baselines3: PEARL with Hindsight Task Relabelling."""
 
-from pathlib import Path
-
 from sb3_htr.adaptation.agent import AdaptedAgent
 from sb3_htr.adaptation.evaluation import evaluate_adaptation
 from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.common.versions import VERSION as __version__
 from sb3_htr.htr import MultiTaskReplayBuffer
 from sb3_htr.pearl import PEARL, load_untrusted
 
-__version__ = (Path(__file__).parent / "version.txt").read_text().strip()
 __all__ = [
     "PEARL",
     "AdaptedAgent",

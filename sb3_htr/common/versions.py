@@ -9,16 +9,18 @@ from typing import Any
 
 import torch as th
 
-PACKAGES = ("sb3_htr", "stable_baselines3", "sb3_contrib", "gymnasium", "rl_zoo3", "torch", "numpy", "mujoco")
+# Of the code that runs, which may be on the path and not installed
+VERSION = (Path(__file__).parents[1] / "version.txt").read_text().strip()
+PACKAGES = ("stable_baselines3", "sb3_contrib", "gymnasium", "rl_zoo3", "torch", "numpy", "mujoco")
 # Older runs and results do not say
 UNKNOWN_HARDWARE = "a machine that was not recorded"
 
 
 def versions() -> dict[str, str]:
     """
-    :return: of Python and of the packages that are installed
+    :return: of Python, of this package and of the others that are installed
     """
-    result = {"python": platform.python_version()}
+    result = {"python": platform.python_version(), "sb3_htr": VERSION}
     for package in PACKAGES:
         try:
             result[package] = version(package)

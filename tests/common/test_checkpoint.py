@@ -154,7 +154,7 @@ def test_reading_a_checkpoint_runs_no_code(tmp_path: Path) -> None:
 
 
 def test_who_wrote_a_checkpoint_may_be_unknown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A package that is on the path, and not installed, has no version."""
+    """Older versions did not say, where the package was on the path and not installed."""
     monkeypatch.setattr("sb3_htr.common.checkpoint.versions", lambda: {"python": "3"})
     write_checkpoint(tmp_path / "1_steps", {"x": 1})
     assert read_checkpoint(tmp_path / "1_steps") == {"x": 1}
