@@ -27,7 +27,7 @@ from sb3_htr.common.checks import (
 from sb3_htr.common.divergence import check_not_diverged
 from sb3_htr.common.random_state import checked_seed
 from sb3_htr.common.saving import CheckedFiles
-from sb3_htr.common.settings import check_keywords, check_layers, check_numbers
+from sb3_htr.common.settings import check_keywords, check_layers, check_mappings, check_numbers
 from sb3_htr.common.training_state import Resumable
 from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env, set_tasks
 from sb3_htr.common.vec_wrappers import in_float32, seed_envs
@@ -157,12 +157,14 @@ class Rival(CheckedFiles, Resumable):
         self.check_names(settings)
         self._check_ranges(settings)
         policy_class = self.policy_aliases.get(policy) if isinstance(policy, str) else policy
+        check_mappings(policy_kwargs=settings.get("policy_kwargs"))
         of_policy = settings.get("policy_kwargs") or {}
         if policy_class is not None:
             check_keywords("policy_kwargs", of_policy, policy_class)
         self._check_ranges(of_policy)
-        if (net_arch := of_policy.get("net_arch")) is not None:
-            check_layers(**net_arch if isinstance(net_arch, dict) else {"net_arch": net_arch})
+        if (layers := of_policy.get("net_arch")) is not None:
+            layers = layers if isinstance(layers, dict) else {"net_arch": layers}
+            check_layers(**{str(network): units for network, units in layers.items()})
         return checked_seed(seed)
 
     def _check_ranges(self, settings: dict[str, Any]) -> None:

@@ -89,8 +89,9 @@ class OffPolicyRival(Rival, OffPolicyAlgorithm):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         assert self.replay_buffer is not None
-        load_replay_state(self.replay_buffer, state["replay"])  # refuses what does not fit before anything is taken
+        check_replay_fits(self.replay_buffer, state["replay"])
         super().load_state_dict(state)
+        load_replay_state(self.replay_buffer, state["replay"])
 
 
 def end_episodes(buffer: ReplayBuffer) -> None:
@@ -113,11 +114,11 @@ def replay_state(buffer: ReplayBuffer) -> dict[str, Any]:
     return {"arrays": arrays, "pos": buffer.pos, "full": buffer.full}
 
 
-def load_replay_state(buffer: ReplayBuffer, state: dict[str, Any]) -> None:
+def check_replay_fits(buffer: ReplayBuffer, state: dict[str, Any]) -> None:
     """
-    :param buffer: with the settings of the one that the state is of
+    :param buffer: of Stable-Baselines3
     :param state: of :func:`replay_state`
-    :raises ValueError: if it is of a buffer of another size, or another number of envs
+    :raises ValueError: if the buffer has no room for it, other ends, or another number of envs
     """
     n_saved, n_envs = state["arrays"]["rewards"].shape
     fits = n_saved == buffer.buffer_size if state["full"] else n_saved <= buffer.buffer_size
@@ -126,6 +127,14 @@ def load_replay_state(buffer: ReplayBuffer, state: dict[str, Any]) -> None:
             f"The replay of the training has {n_saved} steps of each of {n_envs} envs, and the buffer is of "
             f"{buffer.buffer_size} of each of {buffer.n_envs}: give the model the training's buffer_size, and as many envs."
         )
+
+
+def load_replay_state(buffer: ReplayBuffer, state: dict[str, Any]) -> None:
+    """
+    :param buffer: with the settings of the one that the state is of, see :func:`check_replay_fits`
+    :param state: of :func:`replay_state`
+    """
+    n_saved = len(state["arrays"]["rewards"])
     for name, array in _arrays(buffer).items():
         array[:n_saved] = state["arrays"][name].cpu().numpy()
         # HER draws whatever is of a whole episode. Where nothing was stored, memory is not yet taken

@@ -77,12 +77,12 @@ class RL2(OnPolicyRival, RecurrentPPO):
     :param policy: ``"MlpLstmPolicy"`` or a class
     :param env: env of a task family, VecEnv of such envs, or registered id
     :param n_episodes_per_trial: episodes on each task. By RL2's objective all of them count, and the critic looks beyond their
-        ends. The default is our choice: RL2's papers have 2 to 100, by the task
+        ends. The default is our choice: RL2's papers have 2 to 500, by the task
     :param n_trials_per_rollout: trials of each env between two updates. The default is our choice: 80 of 20 envs
     :param seed: seed of all random generators
-    :param kwargs: arguments of ``RecurrentPPO`` but those in :attr:`FOLLOWS`. ``batch_size`` is four trials by default, and
-        ``gamma`` reaches over a trial: 1 - 1 / steps of a trial, which is the library's 0.99 on the Point Robot. In ``load``
-        they do not follow trials of another length: they are settings of the file
+    :param kwargs: arguments of ``RecurrentPPO`` but those in :attr:`FOLLOWS`. ``batch_size`` None, the default, is four
+        trials, and ``gamma`` None reaches over a trial: 1 - 1 / steps of a trial, the library's 0.99 on the Point Robot. In
+        ``load`` they do not follow trials of another length: they are settings of the file
     :raises ValueError: for a setting that is unknown or out of its range, an env without tasks or time limit, or a
         ``batch_size`` that leaves a minibatch of one step
     """

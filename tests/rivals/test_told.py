@@ -234,7 +234,16 @@ def test_a_replay_of_another_size_is_refused(n_steps: int, n_envs: int, buffer_s
     model = tiny_sac_her(make_task_vec_env(ENV_ID, n_envs, seed=0), buffer_size=buffer_size)
     with pytest.raises(ValueError, match=message):
         model.load_state_dict(state)
-    assert model.num_timesteps == 0, "nothing was taken"
+    assert model.replay_buffer is not None
+    assert model.num_timesteps == 0 and model.replay_buffer.size() == 0, "nothing was taken"
+
+
+def test_networks_that_do_not_fit_leave_the_replay_as_it_was() -> None:
+    state = tiny_sac_her(buffer_size=200).learn(40).state_dict()
+    model = tiny_sac_her(buffer_size=200, policy_kwargs={"net_arch": [7]})
+    with pytest.raises(RuntimeError, match="size mismatch"):
+        model.load_state_dict(state)
+    assert model.replay_buffer is not None and model.replay_buffer.size() == 0
 
 
 def test_a_rollout_that_ends_within_an_episode_ends_it_in_the_replay() -> None:

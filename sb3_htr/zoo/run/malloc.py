@@ -11,8 +11,8 @@ def keep_freed_memory() -> bool:
     Ask the C library not to give freed memory back to the operating system.
 
     At the paper's sizes every update allocates and frees the same large arrays. Given back in between, each of their pages is
-    fetched anew: thousands of them in an update, for 4 % of its time. For processes that train and do little else; only glibc can
-    be asked.
+    fetched anew: thousands of them in an update, for 4 % of its time, measured once. For processes that train and do little
+    else; only glibc can be asked.
 
     :return: whether it will
     """

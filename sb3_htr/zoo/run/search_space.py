@@ -116,7 +116,7 @@ PEARL = SearchSpace(
 )
 
 # What rl_zoo3 samples of recurrent PPO, but for what a trial settles: steps of a rollout and of a minibatch; and wider where
-# the best of 50 trials were at the edge of its ranges (0.2, 0.3 and 20)
+# the best of 50 trials were at the edge of its ranges (0.2 and 0.3), or near it (20 epochs)
 RL2 = SearchSpace(
     # The discount must reach over a trial, of several episodes
     floats={
