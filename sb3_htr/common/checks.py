@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import get_device
@@ -50,6 +51,16 @@ def check_has_env(env: VecEnv | None) -> None:
     """
     if env is None:
         raise ValueError("The model was loaded without an env, which learning needs: pass env to load, or call set_env.")
+
+
+def check_env_is_given(kind: type[BaseAlgorithm], env: GymEnv | str | None) -> None:
+    """
+    :param kind: of a model whose networks are about to be made, and not by a file
+    :param env: that it was given
+    :raises ValueError: if it was given none
+    """
+    if env is None:
+        raise ValueError(f"{kind.__name__} has no env to make its networks for: pass one, or the id of one.")
 
 
 def check_finite(name: str, values: np.ndarray, envs: Sequence[int] | None = None) -> None:

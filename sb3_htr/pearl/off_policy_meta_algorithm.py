@@ -148,8 +148,8 @@ class OffPolicyMetaAlgorithm(MetaTest, ReplayFiles, CheckedFiles, SAC):
         self._warn_once = WarnOnce()
 
     def _setup_model(self) -> None:
-        if self.env is None and not hasattr(self, "observation_space"):
-            raise ValueError(f"{type(self).__name__} has no env to make its networks for: pass one, or the id of one.")
+        if not hasattr(self, "observation_space"):
+            checks.check_env_is_given(type(self), self.env)
         self._check_policy_class()
         # Not in the constructor: settings can be given to load() too, in place of those of the file
         self._complete_settings()

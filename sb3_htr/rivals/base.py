@@ -18,6 +18,7 @@ from sb3_htr.adaptation.loop import Adapting
 from sb3_htr.common.callback import followed_by, parts_of
 from sb3_htr.common.checks import (
     check_device,
+    check_env_is_given,
     check_finite,
     check_has_env,
     check_is_env,
@@ -135,8 +136,10 @@ class Rival(CheckedFiles, Resumable):
         :param env: env of a task family, VecEnv of such envs, or registered id
         :param seed: seed of all random generators
         :param kwargs: arguments of the library's class but those in :attr:`FOLLOWS`
-        :raises ValueError: for a setting that is unknown, or an env without tasks or time limit
+        :raises ValueError: for a setting that is unknown, or an env that is missing or without tasks or time limit
         """
+        if kwargs.get("_init_setup_model", True):  # as always but in load
+            check_env_is_given(type(self), env)
         seed = self._check_settings(policy, seed, kwargs)
         if kwargs.get("policy_kwargs") is not None:
             # SB3 adds to it, and what was given is the caller's, and in records

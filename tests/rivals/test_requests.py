@@ -34,6 +34,12 @@ def small(kind: Any, env: Any = None, **settings: Any) -> Any:
 
 
 @RIVALS
+def test_a_model_needs_an_env_for_its_networks(kind: Any) -> None:
+    with pytest.raises(ValueError, match=f"{kind.__name__} has no env to make its networks for: pass one, or the id"):
+        kind(kind.DEFAULT_POLICY, None)
+
+
+@RIVALS
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

@@ -153,6 +153,14 @@ def test_a_rollout_follows_from_what_load_is_given(settings: dict[str, Any], n_s
     assert loaded.learn(4 * n_steps).num_timesteps == 4 * n_steps, "two rollouts of two envs"
 
 
+def test_settings_that_follow_from_a_trial_do_so_where_an_env_comes_after_load(tmp_path: Any) -> None:
+    tiny_rl2(gamma=0.9, batch_size=40).save(tmp_path / "model")
+    loaded = RL2.load(tmp_path / "model", gamma=None, batch_size=None)
+    assert loaded.gamma == 1 - 1 / 40 and loaded.batch_size == 160
+    loaded.set_env(make_task_vec_env(ENV_ID, 2))
+    assert loaded.learn(160).num_timesteps == 160
+
+
 def test_it_sees_observations_on_one_scale_and_rewards_as_they_are(tmp_path: Any) -> None:
     model = tiny_rl2(policy_kwargs={"normalize_observations": True})
     features = model.policy.features_extractor
