@@ -5,6 +5,7 @@ import hashlib
 import io
 import json
 import pickle
+import sqlite3
 import sys
 import zipfile
 from collections.abc import Callable
@@ -94,6 +95,22 @@ def test_records(change: Callable[[str], dict[str, Any]], fuse: Path, tmp_path: 
             main(command)
         assert "\n" not in str(refusal.value)
         assert not fuse.exists(), f"sb3-htr {command[0]} ran it"
+
+
+@pytest.mark.parametrize("of_trial", [False, True])
+def test_a_record_connects_to_no_database(of_trial: bool, tmp_path: Path, tiny_pearl: MakePEARL) -> None:
+    """Which would be told passwords of this machine, or get tables."""
+    database = tmp_path / "places.sqlite"
+    sqlite3.connect(database).close()
+    run = make_run(tmp_path / "logs", tiny_pearl())
+    write_checkpoint(run / "checkpoints" / "240_steps", {})
+    record = json.loads((run / RECORD).read_text())
+    study = ["--storage", f"sqlite:///{database}", "--study-name", "x", "--trial-id", "0"]
+    record |= {"arguments": ["--env", ENV_ID, *study], **({"trial": {}} if of_trial else {})}
+    (run / RECORD).write_text(json.dumps(record))
+    with pytest.raises((ValueError, KeyError), match="" if of_trial else "has the argument '--storage', .* add --trust"):
+        main(["train", "--resume", str(run)])
+    assert database.read_bytes() == b""
 
 
 def test_an_env_within_the_env_of_a_record(fuse: Path, tmp_path: Path, tiny_pearl: MakePEARL) -> None:

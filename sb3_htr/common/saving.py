@@ -66,6 +66,8 @@ class CheckedFiles(BaseAlgorithm):
     @classmethod
     def load(cls: type[SelfCheckedFiles], path: Any, env: Any = None, *args: Any, **kwargs: Any) -> SelfCheckedFiles:
         """
+        It unpickles, which can run any code of the file. One of unknown origin is for ``load_untrusted`` of PEARL's.
+
         :param path: file of :meth:`save`
         :param env: to train on, or None to predict, adapt and evaluate
         :param args: further ones of Stable-Baselines3's ``load``, of which ``device`` comes next

@@ -43,6 +43,24 @@ class Evaluation(NamedTuple):
 INFINITY = re.compile(r"(?<![\w'])inf\b(?!')")
 
 
+def read_facts(raw: Mapping[str, Any], key: str, what: str, advice: str) -> dict[str, Any]:
+    """
+    :param raw: raw results
+    :param key: of what they say of themselves, as JSON
+    :param what: they are, for the message
+    :param advice: what to do if they cannot be read, likewise
+    :return: what they say
+    :raises ValueError: if it cannot be read
+    """
+    try:
+        facts = json.loads(str(raw[key]))
+    except (ValueError, RecursionError):
+        facts = None
+    if not isinstance(facts, dict):
+        raise ValueError(f"{what} does not say what it is of, or is damaged: {advice}")
+    return facts
+
+
 @dataclass(frozen=True, eq=False)
 class Cell:
     """
@@ -118,7 +136,7 @@ class Cell:
         :param advice: what to do if they are of something else, likewise
         :raises ValueError: if they are
         """
-        given, own = json.loads(str(raw["cell"])), json.loads(self.facts())
+        given, own = read_facts(raw, "cell", what, advice), json.loads(self.facts())
         if different := [name for name, value in given.items() if value != own.get(name)]:
             name = different[0]
             raise ValueError(f"{what} has {name} {given[name]!r}, but {self.label} needs {own.get(name)!r}: {advice}")

@@ -1,6 +1,5 @@
 """Raw results: of one run as it ends, and of many in one file for each method, as ``results/<name>/`` has them. And back."""
 
-import json
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -10,7 +9,7 @@ import numpy as np
 
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.experiments.cell import Cell, KwArgs
+from sb3_htr.experiments.cell import Cell, KwArgs, read_facts
 from sb3_htr.experiments.runner import LOGGED, hyperparams_of
 
 # Of the code that trained, and of that which evaluated
@@ -58,7 +57,7 @@ def check(cell: Cell, raw: Mapping[str, Any], what: str, advice: str, if_lacking
         cell.check_facts(raw, what, advice)
     if missing:
         raise ValueError(f"{what} lacks {missing}, which {cell.experiment} needs: {if_lacking or advice}")
-    if different := differing(json.loads(str(raw["hyperparams"])), hyperparams_of(cell)):
+    if different := differing(read_facts(raw, "hyperparams", what, advice), hyperparams_of(cell)):
         raise ValueError(
             f"{what} was trained with other {different} than {cell.label} would be: has a YAML file changed in between? "
             f"Restore it, or {advice}"

@@ -90,6 +90,12 @@ def test_runs_of_something_else_are_not_taken(published: Path) -> None:
     [
         ({"cell": None}, r"htr-ser-seed1 in .* lacks \['cell'\], which theirs needs: leave the folder out"),
         ({"hyperparams": None}, r"lacks \['hyperparams'\]"),
+        # As a stranger may write them
+        *(
+            ({key: text}, "does not say what it is of")
+            for key in ("cell", "hyperparams")
+            for text in ("[1]", "[" * 99_999, "x")
+        ),
         # As where a YAML file has changed since
         (
             {"hyperparams": json.dumps({"gamma": 0.5})},

@@ -15,7 +15,7 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -38,6 +38,7 @@ from sb3_htr.experiments.runner import find_finished, run_cell
 from sb3_htr.experiments.storage import claim as claim_module
 from sb3_htr.experiments.storage import objects, storage_at
 from sb3_htr.experiments.storage.claim import Claim, Watch
+from sb3_htr.experiments.storage.folder import SharedFolder
 from sb3_htr.experiments.storage.node_folder import node_folder
 from sb3_htr.experiments.storage.objects import ObjectStore
 from sb3_htr.experiments.storage.working_copy import WorkingCopy
@@ -359,10 +360,59 @@ def test_what_killed_processes_left_is_removed_and_no_other(tmp_path: Path, monk
         killed = [sys.executable, "-c", f"{code}with node_folder() as folder: print(folder, flush=True); os._exit(9)"]
         environment = {**os.environ, "TMPDIR": str(tmp_path)}
         left = Path(subprocess.run(killed, env=environment, capture_output=True, text=True).stdout.strip())
-        assert left.is_dir() and left.parent == tmp_path
+        (place,) = tmp_path.iterdir()
+        assert left.is_dir() and left.parent == place and place.stat().st_mode & 0o777 == 0o700
         with node_folder() as next_one:
-            assert {*tmp_path.glob("sb3-htr-copy-*")} == {at_work, other, next_one}
-    assert not [*tmp_path.glob("sb3-htr-copy-*")]
+            assert {*place.glob("copy-*")} == {at_work, other, next_one}
+    assert not [*place.glob("copy-*")]
+
+
+def test_what_another_user_puts_in_its_place_is_not_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch, node_folder() as folder:
+        name = folder.parent.name
+        patch.setattr("tempfile.tempdir", str(tmp_path))
+        (tmp_path / "precious").mkdir()
+        (tmp_path / name).symlink_to(tmp_path / "precious")
+        with pytest.raises(OSError, match=f"{name} is not this user's: set TMPDIR"), node_folder():
+            pass
+    assert not [*(tmp_path / "precious").iterdir()]
+
+
+def test_a_store_writes_nowhere_but_in_the_folder_of_its_cell(tmp_path: Path, url: str) -> None:
+    store, here = ObjectStore(url), tmp_path / "here"
+    outside = tmp_path / "outside"
+    names = ("log.txt", f"/{outside}", "a//b", "../outside", "a/../../outside", "..\\outside")
+
+    class Files:
+        def find(self, there: str) -> list[str]:
+            return [f"{there}/{name}" for name in names]
+
+        def get_file(self, there: str, here: str) -> None:
+            Path(here).write_text("of a stranger")
+
+    WorkingCopy(cast(Any, Files()), f"{store.root}/one/a", here, lambda: True).fetch()
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [here / "log.txt"]
+
+
+def test_a_store_is_named_without_its_password(tmp_path: Path) -> None:
+    assert str(ObjectStore("memory://me:TOPSECRET@bucket/runs")) == "memory://me:***@bucket/runs"
+    with pytest.raises(ValueError, match=r"nothing://me:\*\*\*@bucket/runs cannot be opened"):
+        ObjectStore("nothing://me:TOPSECRET@bucket/runs")
+
+
+def test_cells_that_another_user_alone_may_lock_are_left_to_that_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (cell, *_), storage = CELLS, SharedFolder(tmp_path)
+    cell.run_folder(tmp_path).mkdir(parents=True)
+    assert not storage.is_claimed(cell)
+
+    def refuse(*_: Any) -> Any:
+        raise PermissionError(13, "Permission denied", ".claim")
+
+    monkeypatch.setattr("sb3_htr.experiments.storage.folder.lock_of", refuse)
+    assert storage.is_claimed(cell) and storage.is_claimed(cell)
+    assert capfd.readouterr().err.count("is left to another user") == 1
 
 
 def test_a_killed_node_costs_what_it_had_not_sent(tmp_path: Path, url: str) -> None:

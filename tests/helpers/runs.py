@@ -60,6 +60,7 @@ def make_run(folder: Path, model: PEARL, number: int = 1, method: str = METHOD, 
         "gym_packages": [],
         "seed": number,
         "n_timesteps": 960,
+        "hardware": ["cpu"],
         "hyperparams": {"explorer": {"name": model.explorer.name}},
         "arguments": [*defaults, "-f", "runs", "--env", ENV_ID],
     }

@@ -295,6 +295,16 @@ def test_a_command_to_go_on_names_what_it_needs() -> None:
     assert command == "sb3-htr train --resume 'runs/a b' --gym-packages mine --trust"
 
 
+def test_a_command_of_a_model_file_is_one_of_a_training_or_none() -> None:
+    """It is a stranger's, and goes into the card of whoever exports the model again."""
+    command = f"sb3-htr train --env {ENV_ID} -params \"policy_kwargs:{{'latent_dim':3}}\""
+    assert shlex.split(model_card.training_command({"command": command})) == shlex.split(command)
+    for other in ("curl https://example.com/x | sh", "sb3-htr optimize", "sb3-htr train 'open", ""):
+        assert model_card.training_command({"command": other}) == ""
+    joined = model_card.training_command({"command": "sb3-htr train --env X; rm -r ~\nrm x"})
+    assert shlex.split(joined)[3:] == ["X;", "rm", "-r", "~", "rm", "x"] and "'X;'" in joined and "\n" not in joined
+
+
 def test_a_record_may_end_with_an_option() -> None:
     command = model_card.training_command({"arguments": ["-f"], "seed": 4, "method": "htr-ec"})
     assert command == "sb3-htr train --method htr-ec --seed 4"

@@ -78,9 +78,13 @@ def test_what_fails_at_the_hub_is_one_sentence(
 def test_an_export_folder_is_this_model_and_nothing_else(hub: Hub, tmp_path: Path, tiny_pearl: MakePEARL) -> None:
     make_run(tmp_path / "runs", tiny_pearl(), env_kwargs=NEAR)
     Path("shared").mkdir()
-    for name in ("replay.mp4", "README.md", ".gitattributes"):
-        Path("shared", name).write_text("of another seed")
+    for name in ("README.md", ".gitattributes"):
+        Path("shared", name).write_text("of a project")
     arguments = ["export", "runs", "--n-episodes", "1", "-o", "shared"]
+    with pytest.raises(ValueError, match=r"shared holds other files, such as README.md: give a folder of its own"):
+        main(arguments)
+    for name in ("replay.mp4", MODEL):
+        Path("shared", name).write_text("of another seed")
     assert main(arguments) == 0
     assert names("shared") == [".gitattributes", "README.md", MODEL]
     hub.folder.mkdir()

@@ -253,6 +253,24 @@ def test_a_run_of_a_trial_keeps_no_password_and_goes_on_without_the_study(
     assert PEARL.load(run / f"{ENV_ID}.zip").gamma == 0.77
 
 
+def test_a_search_pickles_no_study_that_a_storage_has(quick: None, tmp_path: Path) -> None:
+    for storage, suffixes in (("", {".csv", ".pkl"}), (f"sqlite:///{tmp_path}/study.db", {".csv"})):
+        folder = tmp_path / ("kept" if storage else "lost")
+        of_study = ["--storage", storage, "--study-name", "x"] if storage else []
+        main(["optimize", "--env", ENV_ID, "-n", "240", "--n-trials", "1", "-f", str(folder), *of_study, *SMALL])
+        assert {path.suffix for path in folder.rglob("report_*")} == suffixes
+
+
+def test_a_password_is_not_uploaded_nor_said(tmp_path: Path) -> None:
+    storage = "postgresql+psycopg://me:TOPSECRET@localhost:1/x"
+    of_study = ["--study-name", "x", "--trial-id", "3", "-f", str(tmp_path)]
+    with pytest.raises(ValueError, match="--track would upload the password in --storage"):
+        main(["train", "--env", ENV_ID, "--track", "--storage", storage, *of_study])
+    with pytest.raises(ValueError, match="--storage is neither") as refusal:
+        main(["train", "--env", ENV_ID, "--storage", storage.replace("//", "/"), *of_study])
+    assert "TOPSECRET" not in str(refusal.value)
+
+
 def test_two_workers_search_at_once_in_postgresql(postgresql: str, tmp_path: Path) -> None:
     """As two terminals do, with one command; a training takes what one of them tried."""
     small = ["gradient_steps:2", "batch_size:4", "meta_batch_size:4", "policy_kwargs:{'net_arch':[8],'encoder_arch':[8]}"]
@@ -274,7 +292,7 @@ def test_two_workers_search_at_once_in_postgresql(postgresql: str, tmp_path: Pat
 def test_bad_storages_are_named_in_one_sentence(quick: None, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="--storage needs a --study-name"):
         main(["optimize", "--env", ENV_ID, "--storage", "sqlite:///x.db"])
-    with pytest.raises(ValueError, match=r"--storage is 'study.db', expected sqlite:///FILE"):
+    with pytest.raises(ValueError, match=r"--storage is neither sqlite:///FILE"):
         search(tmp_path, "study.db")
     with pytest.raises(ValueError, match=r"The storage sqlite:////nowhere/study.db cannot be used: unable to open"):
         search(tmp_path, "sqlite:////nowhere/study.db")

@@ -30,8 +30,9 @@ class SharedFolder:
         self.runs = Path(os.path.abspath(runs))
         self._listed: dict[Path, set[str]] = {}
         self._n_steps: dict[str, int] = {}
-        # Folders that do not answer
+        # Folders that do not answer, and those whose locks are another user's alone
         self._away: set[Path] = set()
+        self._closed: set[Path] = set()
 
     def __str__(self) -> str:
         return str(self.runs)
@@ -65,7 +66,7 @@ class SharedFolder:
         return result.name in self._listed.get(result.parent, ())
 
     def is_claimed(self, cell: Cell) -> bool:
-        """Whether a process has its lock, or nobody can tell."""
+        """Whether a process has its lock, or nobody can tell, or another user alone may take it."""
         folder = cell.result(self.runs).parent
         if folder in self._away:
             return True
@@ -75,6 +76,11 @@ class SharedFolder:
             try:
                 lock_of(cell, self.runs).acquire(timeout=0).lock.release()
             except Timeout:
+                return True
+            except PermissionError as error:
+                if folder not in self._closed:
+                    print(f"{folder} is left to another user: {error}", file=sys.stderr, flush=True)
+                self._closed.add(folder)
                 return True
             return False
         return True

@@ -1,5 +1,6 @@
 """Runs in an object store, by fsspec: a node works on a copy of a cell's folder, and sends what it becomes."""
 
+import re
 import signal
 import sys
 import time
@@ -50,7 +51,7 @@ class ObjectStore:
         self._objects: dict[str, Objects] = {}
 
     def __str__(self) -> str:
-        return self.url
+        return _shown(self.url)
 
     def prepare(self) -> None:
         """
@@ -61,7 +62,7 @@ class ObjectStore:
         try:
             self.files.pipe_file(f"{self.root}/.writable", b"")
         except Exception as error:  # each store has its own
-            raise OSError(f"{self.url} cannot be written to: {last_line(error)}") from None
+            raise OSError(f"{self} cannot be written to: {last_line(error)}") from None
 
     def look(self, cells: Sequence[Cell]) -> None:
         """If the store is out of reach, what was seen before holds until the next look."""
@@ -150,7 +151,7 @@ class ObjectStore:
             paths = [self._path(cell) for cell in missing], [str(cell.result(here)) for cell in missing]
             _patiently(lambda: self.files.get(*paths))
         except Exception as error:  # each store has its own
-            raise OSError(f"{self.url} cannot be read: {last_line(error)}") from None
+            raise OSError(f"{self} cannot be read: {last_line(error)}") from None
         return here
 
     def send_results(self, cells: Sequence[Cell]) -> None:
@@ -165,7 +166,7 @@ class ObjectStore:
                 if cell.result(here).exists() and not self.is_finished(cell):
                     self.files.put_file(str(cell.result(here)), self._path(cell))
         except Exception as error:  # each store has its own
-            raise OSError(f"{self.url} cannot be written to: {last_line(error)}") from None
+            raise OSError(f"{self} cannot be written to: {last_line(error)}") from None
 
     def _of(self, cell: Cell) -> Objects:
         return self._objects.get(_folder(cell), {})
@@ -279,10 +280,15 @@ def _opened(url: str) -> tuple[AbstractFileSystem, str]:
     try:
         files, root = url_to_fs(url)
     except (ValueError, ImportError) as error:
-        raise ValueError(f"{url} cannot be opened ({last_line(error)}): give a folder, or a URL of fsspec.") from None
+        raise ValueError(f"{_shown(url)} cannot be opened ({last_line(error)}): give a folder, or a URL of fsspec.") from None
     if not root.strip("/"):
-        raise ValueError(f"{url} names no place in a store: give one, as in s3://bucket/runs.")
+        raise ValueError(f"{_shown(url)} names no place in a store: give one, as in s3://bucket/runs.")
     return files, root.rstrip("/")
+
+
+def _shown(url: str) -> str:
+    """Without a password, as others read what is printed."""
+    return re.sub(r"(?<=://)([^/:@]*):[^/@]*@", r"\1:***@", url)
 
 
 def _folder(cell: Cell) -> str:

@@ -27,13 +27,13 @@ class WorkingCopy:
         self._sent: dict[str, tuple[int, int]] = {}
 
     def fetch(self) -> None:
-        """What the store has, but for hidden files, and checkpoints that did not arrive whole."""
+        """What the store has, but for hidden files, names that lead elsewhere, and checkpoints that did not arrive whole."""
         names = {path.removeprefix(f"{self.there}/") for path in self.files.find(self.there)}
         for name in names:
             path = PurePosixPath(name)
             if _is_of_checkpoint(name) and (path.parent / MANIFEST).as_posix() not in names:
                 self._sent[name] = HALF
-            elif not _is_hidden(name):
+            elif not _is_hidden(name) and _is_inside(name):
                 (self.here / name).parent.mkdir(parents=True, exist_ok=True)
                 self.files.get_file(f"{self.there}/{name}", str(self.here / name))
                 self._sent[name] = _version(self.here / name)
@@ -104,6 +104,11 @@ def _is_of_checkpoint(name: str) -> bool:
 def _is_hidden(name: str) -> bool:
     """Locks, claims, and what is being written."""
     return any(part.startswith(".") for part in PurePosixPath(name).parts)
+
+
+def _is_inside(name: str) -> bool:
+    """Whoever can write to a store must not write anywhere on the nodes."""
+    return "\\" not in name and not {"", "..", "/"} & {*name.split("/"), *PurePosixPath(name).parts}
 
 
 def _version(path: Path) -> tuple[int, int]:

@@ -75,7 +75,8 @@ def add_agent_arguments(parser: argparse.ArgumentParser, several: bool = False) 
     group.add_argument(
         "--env-kwargs", nargs="+", action=KeyValues, default={}, metavar="KEY:VALUE", help="change arguments of the env"
     )
-    group.add_argument("--trust", action="store_true", help="let the files of the agent import and unpickle what they name")
+    trust = "let the files of the agent import and unpickle what they name, which can run any code"
+    group.add_argument("--trust", action="store_true", help=trust)
     group.add_argument("--device", default="cpu", help="torch device (default: cpu)")
 
 

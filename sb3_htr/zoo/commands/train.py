@@ -14,10 +14,10 @@ from sb3_htr.common.checkpoint import n_steps_done
 from sb3_htr.zoo.run.agents import find_runs, is_finished, n_steps_of
 from sb3_htr.zoo.run.malloc import keep_freed_memory
 from sb3_htr.zoo.run.method import DEFAULT, get_method, methods
-from sb3_htr.zoo.run.record import OF_TRAINING, RECORD, command_to_go_on, read_record
+from sb3_htr.zoo.run.record import OF_TRAINING, RECORD, arguments_to_go_on, command_to_go_on, read_record
 from sb3_htr.zoo.run.rl_zoo import run_rl_zoo
-from sb3_htr.zoo.run.study import absolute
-from sb3_htr.zoo.run.train_arguments import check_options, default_arguments, given_arguments, spelled_out, value_of
+from sb3_htr.zoo.run.study import absolute, check_has_no_password
+from sb3_htr.zoo.run.train_arguments import check_options, default_arguments, spelled_out, value_of
 from sb3_htr.zoo.run.trust import CONF, WEIGHTS, check_arguments, import_packages, see_working_folder
 
 OWN_ENV = "An env of your own is found once its module is imported, by --gym-packages MODULE."
@@ -39,7 +39,7 @@ beside rl_zoo3's:
   --resume RUN   go on with a run from its latest checkpoint, exactly; takes no other arguments but --trust, the
                  --gym-packages of an env of your own, and -n STEPS: so many more than planned; a learning rate that decays
                  does so anew over what is then planned
-  --trust        let files (YAML, the record of a run) import and evaluate what they name
+  --trust        let files (YAML, the record of a run) import and evaluate what they name, which can run any code
 no effect here: --n-eval-envs
 """
 
@@ -93,7 +93,7 @@ def main(argv: Sequence[str]) -> None:
                 + (further_on if done else "Its checkpoints were removed, so it cannot be trained further.")
             )
             return
-        given = [*given_arguments(record["arguments"]), "--seed", str(record["seed"]), "-n", str(planned)]
+        given = [*arguments_to_go_on(record), "--seed", str(record["seed"]), "-n", str(planned)]
         check_arguments(given, record["gym_packages"], run / RECORD, args.trust, args.gym_packages)
         import_packages(args.gym_packages, record["gym_packages"], run / RECORD, args.trust)
         args.method = record["method"]
@@ -106,6 +106,8 @@ def main(argv: Sequence[str]) -> None:
         packages = ["--gym-packages", *args.gym_packages] if args.gym_packages else []
         rest = spelled_out(rest)
         check_options(rest)
+        if "--track" in rest:
+            check_has_no_password(value_of(rest, "--storage"))
         given = [*env, *_from_anywhere(rest), *packages]
         try:
             find_hidden(args.env or "")

@@ -14,6 +14,7 @@ from sb3_htr.common.markdown import markdown_table
 from sb3_htr.zoo.run.algorithm import Algorithm
 from sb3_htr.zoo.run.hub import model_name
 from sb3_htr.zoo.run.method import DEFAULT, PEARLMethod, get_method, merged, methods
+from sb3_htr.zoo.run.record import OF_STUDY
 from sb3_htr.zoo.run.shipped import block_of, hyperparams_file
 from sb3_htr.zoo.run.train_arguments import given_arguments, value_of
 from sb3_htr.zoo.run.trust import CONF, PACKAGES, WEIGHTS
@@ -33,7 +34,7 @@ OF_EXPLORERS = """ The explorer says how z is chosen;
 # Arguments of a training that change nothing of its result, or name what is on one machine alone, with the number of their
 # values. What a study brought is among -params
 LOCAL = {"-f": 1, "--log-folder": 1, "-tb": 1, "--tensorboard-log": 1, "-P": 0, "--progress": 0, "--verbose": 1, "--seed": 1}
-LOCAL |= dict.fromkeys(("--storage", "--study-name", "--trial-id"), 1)
+LOCAL |= dict.fromkeys(OF_STUDY, 1)
 # In JSON, what Python has no literal for: descriptions of objects, as <class 'torch.nn.modules.activation.Tanh'>, and numbers
 NOT_WRITTEN = re.compile(r'"<|NaN|Infinity')
 
@@ -44,7 +45,7 @@ def training_command(record: dict[str, Any]) -> str:
     :return: the command that trains the same agent on another machine, empty if there is none; of files it has the names alone
     """
     if "arguments" not in record:
-        return str(record.get("command", ""))
+        return _checked(str(record.get("command", "")))
     arguments = given_arguments(record["arguments"])
     conf = value_of(arguments, *CONF)
     has_own_settings = not (conf is None or _is_of_package(conf)) or "--trial-id" in arguments
@@ -71,6 +72,15 @@ def training_command(record: dict[str, Any]) -> str:
             return ""
         words += params
     return shlex.join(["sb3-htr", "train", *words, "--seed", str(record["seed"])])
+
+
+def _checked(command: str) -> str:
+    """That of a file, which may be a stranger's, to be given to a shell: a training, or nothing."""
+    try:
+        words = shlex.split(command)
+    except ValueError:  # an open quote
+        words = []
+    return shlex.join(words) if words[:2] == ["sb3-htr", "train"] else ""
 
 
 def _is_of_package(conf: str) -> bool:

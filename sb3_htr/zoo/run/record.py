@@ -8,6 +8,7 @@ from typing import Any, cast
 
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.versions import UNKNOWN_HARDWARE, differences, made_by
+from sb3_htr.zoo.run.train_arguments import given_arguments
 from sb3_htr.zoo.run.trust import PACKAGES
 
 # Record of a run: in its folder, and in an exported model file
@@ -19,6 +20,8 @@ REQUIRED = {"env_id": str, "env_kwargs": dict, "gym_packages": list}
 OF_TRAINING = {"arguments": list, "n_timesteps": int, "seed": int, "method": str, "hyperparams": dict, "hardware": list}
 # Which it has if they were of a trial of a study: its hyperparameters
 TRIAL = "trial"
+# By which the arguments name that trial, with a value each
+OF_STUDY = ("--storage", "--study-name", "--trial-id")
 
 
 def read_record(path: Path, content: bytes | None = None) -> dict[str, Any]:
@@ -40,6 +43,18 @@ def read_record(path: Path, content: bytes | None = None) -> dict[str, Any]:
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         pass
     raise ValueError(f"{path} is damaged, or no record of a run: it must say env_id, env_kwargs and gym_packages.")
+
+
+def arguments_to_go_on(record: dict[str, Any]) -> list[str]:
+    """
+    :param record: of a run
+    :return: what the user gave, but for a study whose trial the record has
+    """
+    given = given_arguments(record["arguments"])
+    if TRIAL not in record:
+        return given
+    of_study = [option in OF_STUDY or word in OF_STUDY for option, word in zip(["", *given], given, strict=False)]
+    return [word for word, leave_out in zip(given, of_study, strict=True) if not leave_out]
 
 
 def command_to_go_on(run: Path, record: dict[str, Any], trust: bool = False) -> str:

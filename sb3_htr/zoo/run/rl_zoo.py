@@ -18,7 +18,7 @@ from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.zoo.run.algorithm import Algorithm
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback
 from sb3_htr.zoo.run.manager import MetaExperimentManager
-from sb3_htr.zoo.run.search_manager import SearchManager
+from sb3_htr.zoo.run.search_manager import SearchManager, pickle_study
 from sb3_htr.zoo.run.training_manager import TrainingManager
 
 
@@ -55,6 +55,8 @@ def run_rl_zoo(
             "TrialEvalCallback": MetaTrialEvalCallback,
             "CheckpointCallback": CheckpointCallback,
             "ProgressBarCallback": MetaProgressBarCallback,
+            # It pickles studies alone
+            "pkl": SimpleNamespace(dump=pickle_study),
         },
         rl_zoo3.train: {
             "ExperimentManager": make_manager,

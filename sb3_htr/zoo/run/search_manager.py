@@ -1,9 +1,10 @@
 """A search for hyperparameters by rl_zoo3 and Optuna."""
 
 import json
+import pickle
 import traceback
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import optuna
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
@@ -13,6 +14,20 @@ from sb3_htr.common.divergence import DivergedError
 from sb3_htr.zoo.run.manager import MetaExperimentManager
 from sb3_htr.zoo.run.method import merged, names_of
 from sb3_htr.zoo.run.study import check_is_of
+
+
+def pickle_study(study: optuna.Study, file: IO[bytes]) -> None:
+    """
+    In the place of the file that rl_zoo3 opens for it beside its report: that of a storage, which has the study, would have
+    the password of a database in it, and is removed.
+
+    :param study: that was searched
+    :param file: for it
+    """
+    if isinstance(study._storage, optuna.storages.InMemoryStorage):
+        pickle.dump(study, file)
+    else:
+        Path(file.name).unlink()
 
 
 class SearchManager(MetaExperimentManager):

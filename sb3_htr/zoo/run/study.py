@@ -21,7 +21,8 @@ def url_of(storage: str) -> sqlalchemy.URL | None:
         return sqlalchemy.make_url(storage)
     except sqlalchemy.exc.ArgumentError:
         raise ValueError(
-            f"--storage is {storage!r}, expected sqlite:///FILE, postgresql+psycopg://USER:PASSWORD@HOST/DATABASE or FILE.log."
+            # Not what it is, as there may be a password in it
+            "--storage is neither sqlite:///FILE, postgresql+psycopg://USER:PASSWORD@HOST/DATABASE nor FILE.log."
         ) from None
 
 
@@ -98,6 +99,17 @@ def check_is_of(storage: str, name: str | None, facts: dict[str, Any], note: boo
 def _without(settings: dict[str, Any], others: dict[str, Any]) -> dict[str, Any]:
     """Those that the others do not have, or have otherwise."""
     return {name: value for name, value in settings.items() if (name, value) not in others.items()}
+
+
+def check_has_no_password(storage: str | None) -> None:
+    """
+    :param storage: of a run that is uploaded, with its arguments
+    :raises ValueError: if its password would be, too
+    """
+    if storage is not None and without_password(storage) != storage:
+        raise ValueError(
+            "--track would upload the password in --storage: leave it out there, and give it as PGPASSWORD or in ~/.pgpass."
+        )
 
 
 def without_password(storage: str) -> str:

@@ -21,10 +21,17 @@ from sb3_htr.common.versions import hardware, made_by
 from sb3_htr.zoo.run.callbacks import ProgressCallback
 from sb3_htr.zoo.run.folder import SystemLock, claim, lock
 from sb3_htr.zoo.run.manager import MetaExperimentManager
-from sb3_htr.zoo.run.record import RECORD, TRIAL, command_to_go_on, read_record, record_going_on, write_record
+from sb3_htr.zoo.run.record import (
+    RECORD,
+    TRIAL,
+    arguments_to_go_on,
+    command_to_go_on,
+    read_record,
+    record_going_on,
+    write_record,
+)
 from sb3_htr.zoo.run.soft_interrupt import soft_interrupt
 from sb3_htr.zoo.run.study import check_is_of, check_is_there, without_password
-from sb3_htr.zoo.run.train_arguments import given_arguments
 from sb3_htr.zoo.run.trust import check_arguments, plain_settings
 
 
@@ -60,7 +67,8 @@ class TrainingManager(MetaExperimentManager):
             self._trial = self.load_trial(self.storage, self.study_name, trial_id)
         except (KeyError, IndexError):
             raise ValueError(
-                f"{self.storage} has no study {self.study_name!r} with a trial {trial_id}: `sb3-htr optimize` prints both."
+                f"{without_password(self.storage)} has no study {self.study_name!r} with a trial {trial_id}: "
+                "`sb3-htr optimize` prints both."
             ) from None
         print(f"With those of trial {trial_id}: {self._trial}")
         return self._trial
@@ -157,7 +165,7 @@ class TrainingManager(MetaExperimentManager):
         record = read_record(Path(self.save_path) / RECORD)
         trust = self.trust
         try:
-            check_arguments(given_arguments(record["arguments"]), record["gym_packages"], RECORD, trust, packages)
+            check_arguments(arguments_to_go_on(record), record["gym_packages"], RECORD, trust, packages)
             plain_settings(self._given, RECORD, trust, packages)
         except ValueError:  # what a user may say, the record may not
             trust = True

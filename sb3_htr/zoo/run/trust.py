@@ -21,7 +21,8 @@ KEY_VALUES = ("-params", "--hyperparams", "--env-kwargs", "--eval-env-kwargs")
 CONF = ("-conf", "--conf-file")
 # A model to begin with, whose weights and plain settings alone are taken
 WEIGHTS = ("-i", "--trained-agent")
-# Those that neither search nor upload, nor have code loaded. By their full names: an abbreviation could be one of any other
+# Those that neither search nor upload, nor connect, which hands passwords over, nor have code loaded. By their full names: an
+# abbreviation could be one of any other
 HARMLESS = (
     *KEY_VALUES,
     *CONF,
@@ -29,7 +30,6 @@ HARMLESS = (
     *("--algo", "--env", "--gym-packages", "-n", "--n-timesteps", "--seed", "--num-threads", "--vec-env", "--device"),
     *("-f", "--log-folder", "-tb", "--tensorboard-log", "--log-interval", "--verbose", "-P", "--progress", "-uuid", "--uuid"),
     *("--eval-freq", "--eval-episodes", "--n-eval-envs", "--save-freq", "--save-replay-buffer"),
-    *("--storage", "--study-name", "--trial-id"),
 )
 
 
