@@ -30,9 +30,8 @@ class SharedFolder:
         self.runs = Path(os.path.abspath(runs))
         self._listed: dict[Path, set[str]] = {}
         self._n_steps: dict[str, int] = {}
-        # Folders that do not answer, and those whose locks are another user's alone
+        # Folders that do not answer
         self._away: set[Path] = set()
-        self._closed: set[Path] = set()
 
     def __str__(self) -> str:
         return str(self.runs)
@@ -66,7 +65,7 @@ class SharedFolder:
         return result.name in self._listed.get(result.parent, ())
 
     def is_claimed(self, cell: Cell) -> bool:
-        """Whether a process has its lock, or nobody can tell, or another user alone may take it."""
+        """Whether a process has its lock, or nobody can tell."""
         folder = cell.result(self.runs).parent
         if folder in self._away:
             return True
@@ -78,10 +77,10 @@ class SharedFolder:
             except Timeout:
                 return True
             except PermissionError as error:
-                if folder not in self._closed:
-                    print(f"{folder} is left to another user: {error}", file=sys.stderr, flush=True)
-                self._closed.add(folder)
-                return True
+                raise PermissionError(
+                    f"{error}: the lock of this cell is another user's alone. Share the folder in a common group, with umask "
+                    "002 where the cells run, or give --runs of your own."
+                ) from None
             return False
         return True
 
