@@ -40,7 +40,7 @@ USAGE = (
 # Packages that the base installation does not bring, and the extra that does
 EXTRAS = {
     **dict.fromkeys(("rl_zoo3", "optuna", "sqlalchemy", "yaml", "huggingface_hub", "filelock", "sb3_contrib"), "zoo"),
-    **dict.fromkeys(("matplotlib", "rliable", "pandas", "scipy"), "zoo"),
+    **dict.fromkeys(("matplotlib", "rliable", "pandas", "scipy", "seaborn", "requests", "fsspec"), "zoo"),
     "PIL": "video",
     "pygame": "video",
     "imageio_ffmpeg": "video",

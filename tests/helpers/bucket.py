@@ -17,6 +17,11 @@ class Bucket(LocalFileSystem):
 
     protocol = PROTOCOL
 
+    @classmethod
+    def _strip_protocol(cls, path: Any) -> str:
+        # Earlier versions of fsspec do so for "file://" alone
+        return str(super()._strip_protocol(str(path).removeprefix(f"{PROTOCOL}://")))
+
     def pipe_file(self, path: str, value: bytes, mode: str = "overwrite", **_: Any) -> None:
         part = self._part(path)
         part.write_bytes(value)
