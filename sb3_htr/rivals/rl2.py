@@ -130,7 +130,7 @@ class RL2(OnPolicyRival, RecurrentPPO):
         check_numbers(n_episodes_per_trial=(self.n_episodes_per_trial, 1), n_trials_per_rollout=(self.n_trials_per_rollout, 1))
         if self.env is not None:
             self.n_steps = self._n_steps_in(self.env)
-        n_trial_steps = self.n_steps // self.n_trials_per_rollout
+        n_trial_steps = max(self.n_steps // self.n_trials_per_rollout, 1)
         # Gradients go through a minibatch, in the order of its steps, and no further
         self.batch_size = N_TRIALS_PER_BATCH * n_trial_steps if self.batch_size is None else self.batch_size
         # What the first episodes find out is worth what the last ones return

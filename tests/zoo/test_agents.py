@@ -30,7 +30,7 @@ from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run import model_card
 from sb3_htr.zoo.run.agents import agent_at, agent_for
 from sb3_htr.zoo.run.method import get_method
-from sb3_htr.zoo.run.record import RECORD, command_to_go_on, read_record
+from sb3_htr.zoo.run.record import RECORD, arguments_to_go_on, command_to_go_on, read_record
 from sb3_htr.zoo.run.shipped import hyperparams_file, shipped
 from sb3_htr.zoo.run.train_arguments import training_facts
 
@@ -295,14 +295,20 @@ def test_a_command_to_go_on_names_what_it_needs() -> None:
     assert command == "sb3-htr train --resume 'runs/a b' --gym-packages mine --trust"
 
 
-def test_a_command_of_a_model_file_is_one_of_a_training_or_none() -> None:
+def test_a_command_of_a_model_file_is_a_training_that_runs_no_other_code_or_none() -> None:
     """It is a stranger's, and goes into the card of whoever exports the model again."""
-    command = f"sb3-htr train --env {ENV_ID} -params \"policy_kwargs:{{'latent_dim':3}}\""
-    assert shlex.split(model_card.training_command({"command": command})) == shlex.split(command)
+
+    def shown(command: str) -> str:
+        return model_card.training_command({"command": command, "gym_packages": []})
+
+    command = f"sb3-htr train --env {ENV_ID} -params \"policy_kwargs:{{'latent_dim':3}}\" --method htr-ec --seed 3"
+    assert shlex.split(shown(command)) == shlex.split(command)
     for other in ("curl https://example.com/x | sh", "sb3-htr optimize", "sb3-htr train 'open", ""):
-        assert model_card.training_command({"command": other}) == ""
-    joined = model_card.training_command({"command": "sb3-htr train --env X; rm -r ~\nrm x"})
-    assert shlex.split(joined)[3:] == ["X;", "rm", "-r", "~", "rm", "x"] and "'X;'" in joined and "\n" not in joined
+        assert shown(other) == ""
+    for other in ("-params gamma:open('x')", "--gym-packages evil", "--trust", "'a\n```\n$ rm x'", "-f '`rm x`'"):
+        assert shown(f"sb3-htr train --env X {other}") == ""
+    joined = shown("sb3-htr train --env X; rm -r x\nrm y")
+    assert "\n" not in joined and joined in ("", "sb3-htr train --env 'X;' rm -r x rm y")
 
 
 def test_a_record_may_end_with_an_option() -> None:
@@ -347,10 +353,15 @@ def test_the_command_of_a_trial_has_what_the_trial_had() -> None:
     """Whoever has the study. What -params gave is among it."""
     arguments = ["--env", ENV_ID, "-params", "gamma:0.9", "n_envs:20", "-n", "480", "--storage", "x.log", "--study-name", "x"]
     found = {"n_timesteps": 480, "learning_rate": "lin_0.002", "gamma": 0.9, "policy_kwargs": {"latent_dim": 3}}
-    record = {"arguments": [*arguments, "--trial-id", "7"], "seed": 4, "method": "htr-ser", "env_id": ENV_ID}
+    record: dict[str, Any] = {"arguments": [*arguments, "--trial-id", "7"], "seed": 4, "method": "htr-ser", "env_id": ENV_ID}
     command = model_card.training_command({**record, "hyperparams": {**settings_of_package(), **found}})
     params = ["learning_rate:'lin_0.002'", "gamma:0.9", "policy_kwargs:{'latent_dim': 3}"]
     expected = ["sb3-htr", "train", "--env", ENV_ID, "-n", "480", "--method", "htr-ser", "-params", *params, "--seed", "4"]
+    assert shlex.split(command) == expected
+    # As one that was trained further, which needs the study no more
+    record |= {"arguments": arguments_to_go_on({**record, "trial": found}), "trial": found}
+    assert "--trial-id" not in record["arguments"]
+    command = model_card.training_command({**record, "hyperparams": {**settings_of_package(), **found}})
     assert shlex.split(command) == expected
 
 

@@ -261,7 +261,7 @@ def test_a_search_pickles_no_study_that_a_storage_has(quick: None, tmp_path: Pat
         assert {path.suffix for path in folder.rglob("report_*")} == suffixes
 
 
-def test_a_password_is_not_uploaded_nor_said(tmp_path: Path) -> None:
+def test_a_password_is_not_uploaded_nor_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     storage = "postgresql+psycopg://me:TOPSECRET@localhost:1/x"
     of_study = ["--study-name", "x", "--trial-id", "3", "-f", str(tmp_path)]
     with pytest.raises(ValueError, match="--track would upload the password in --storage"):
@@ -269,6 +269,10 @@ def test_a_password_is_not_uploaded_nor_said(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="--storage is neither") as refusal:
         main(["train", "--env", ENV_ID, "--storage", storage.replace("//", "/"), *of_study])
     assert "TOPSECRET" not in str(refusal.value)
+    monkeypatch.setattr("sb3_htr.zoo.run.training_manager.check_is_of", lambda *_: None)
+    monkeypatch.setattr(TrainingManager, "load_trial", lambda *_: {"policy": "evil.Policy"})
+    with pytest.raises(ValueError, match=r"me:\*\*\*@localhost:1/x has policy: 'evil\.Policy', which can run any code"):
+        main(["train", "--env", ENV_ID, "--storage", storage, *of_study])
 
 
 def test_two_workers_search_at_once_in_postgresql(postgresql: str, tmp_path: Path) -> None:

@@ -288,7 +288,7 @@ def _opened(url: str) -> tuple[AbstractFileSystem, str]:
 
 def _shown(url: str) -> str:
     """Without a password, as others read what is printed."""
-    return re.sub(r"(?<=://)([^/:@]*):[^/@]*@", r"\1:***@", url)
+    return re.sub(r"(?<=://)([^/:@]*):[^/]*@", r"\1:***@", url)
 
 
 def _folder(cell: Cell) -> str:

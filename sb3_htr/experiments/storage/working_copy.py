@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from tempfile import TemporaryDirectory
 
 from fsspec import AbstractFileSystem
@@ -108,7 +108,7 @@ def _is_hidden(name: str) -> bool:
 
 def _is_inside(name: str) -> bool:
     """Whoever can write to a store must not write anywhere on the nodes."""
-    return "\\" not in name and not {"", "..", "/"} & {*name.split("/"), *PurePosixPath(name).parts}
+    return not ({"", ".."} & {*name.split("/")} or "\\" in name or PureWindowsPath(name).drive)
 
 
 def _version(path: Path) -> tuple[int, int]:

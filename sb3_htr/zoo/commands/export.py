@@ -81,7 +81,7 @@ def earlier_export(folder: Path, names: Sequence[str]) -> list[Path]:
     found = [path.name for path in folder.iterdir() if not path.name.startswith(".")] if folder.is_dir() else []
     others = sorted(set(found) - set(names))
     if others or (found and names[0] not in found):  # a page alone is somebody's own
-        others = others or found
+        others = others or sorted(found)
         raise ValueError(f"{folder} holds other files, such as {others[0]}: give a folder of its own, with -o.")
     return [folder / name for name in found]
 

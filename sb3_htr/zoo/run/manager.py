@@ -23,6 +23,7 @@ from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
 from sb3_htr.zoo.run.method import DEFAULT, get_method, merged
 from sb3_htr.zoo.run.record import RECORD
 from sb3_htr.zoo.run.shipped import find_hyperparams
+from sb3_htr.zoo.run.study import without_password
 from sb3_htr.zoo.run.trust import plain_settings
 from sb3_htr.zoo.run.yaml_checks import checked_kinds
 
@@ -112,7 +113,8 @@ class MetaExperimentManager(ExperimentManager):
         checked_kinds(given, "-params" if self.resumed is None else self.resumed / RECORD)
         self._given = given
         self._check_use()
-        of_trial = checked(self._settings_of_trial(trial_id), self.storage if self.resumed is None else self.resumed / RECORD)
+        of = self.storage and without_password(self.storage) if self.resumed is None else self.resumed / RECORD
+        of_trial = checked(self._settings_of_trial(trial_id), of)
         hyperparams = merged(merged(hyperparams, of_trial), given)
         if self.n_timesteps > 0:
             hyperparams["n_timesteps"] = self.n_timesteps

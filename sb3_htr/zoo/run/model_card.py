@@ -14,10 +14,10 @@ from sb3_htr.common.markdown import markdown_table
 from sb3_htr.zoo.run.algorithm import Algorithm
 from sb3_htr.zoo.run.hub import model_name
 from sb3_htr.zoo.run.method import DEFAULT, PEARLMethod, get_method, merged, methods
-from sb3_htr.zoo.run.record import OF_STUDY
+from sb3_htr.zoo.run.record import OF_STUDY, TRIAL
 from sb3_htr.zoo.run.shipped import block_of, hyperparams_file
 from sb3_htr.zoo.run.train_arguments import given_arguments, value_of
-from sb3_htr.zoo.run.trust import CONF, PACKAGES, WEIGHTS
+from sb3_htr.zoo.run.trust import CONF, PACKAGES, WEIGHTS, check_arguments
 
 TAGS = (
     "deep-reinforcement-learning",
@@ -45,10 +45,10 @@ def training_command(record: dict[str, Any]) -> str:
     :return: the command that trains the same agent on another machine, empty if there is none; of files it has the names alone
     """
     if "arguments" not in record:
-        return _checked(str(record.get("command", "")))
+        return _checked(record)
     arguments = given_arguments(record["arguments"])
     conf = value_of(arguments, *CONF)
-    has_own_settings = not (conf is None or _is_of_package(conf)) or "--trial-id" in arguments
+    has_own_settings = not (conf is None or _is_of_package(conf)) or TRIAL in record or "--trial-id" in arguments
     words: list[str] = []
     while arguments:
         word = arguments.pop(0)
@@ -71,16 +71,27 @@ def training_command(record: dict[str, Any]) -> str:
         if params is None:
             return ""
         words += params
-    return shlex.join(["sb3-htr", "train", *words, "--seed", str(record["seed"])])
+    return _in_a_line(["sb3-htr", "train", *words, "--seed", str(record["seed"])])
 
 
-def _checked(command: str) -> str:
-    """That of a file, which may be a stranger's, to be given to a shell: a training, or nothing."""
+def _checked(record: dict[str, Any]) -> str:
+    """That of a file, which may be a stranger's, to be given to a shell: a training that runs no other code, or none."""
     try:
-        words = shlex.split(command)
-    except ValueError:  # an open quote
-        words = []
-    return shlex.join(words) if words[:2] == ["sb3-htr", "train"] else ""
+        words = shlex.split(str(record.get("command", "")))
+        rest = list(words)
+        if "--method" in rest:
+            at = rest.index("--method")
+            del rest[at : at + 2]
+        check_arguments(rest[2:], record["gym_packages"], "the command", trust=False)
+    except ValueError:  # an open quote is one, too
+        return ""
+    return _in_a_line(words) if words[:2] == ["sb3-htr", "train"] else ""
+
+
+def _in_a_line(words: list[str]) -> str:
+    """For a block of a page that a word must not end; empty if one would."""
+    command = shlex.join(words)
+    return "" if "`" in command or len(command.splitlines()) > 1 else command
 
 
 def _is_of_package(conf: str) -> bool:

@@ -27,6 +27,7 @@ def pickle_study(study: optuna.Study, file: IO[bytes]) -> None:
     if isinstance(study._storage, optuna.storages.InMemoryStorage):
         pickle.dump(study, file)
     else:
+        file.close()
         Path(file.name).unlink()
 
 

@@ -93,6 +93,11 @@ def check_arguments(
             refused = (option in CONF and not word.endswith((".yml", ".yaml"))) or (
                 option == "--gym-packages" and word not in packages
             )
+        if word == "--storage":
+            raise ValueError(
+                f"{file} has the argument '--storage', whose database may be told passwords of this machine: add --trust if "
+                "you know where the file comes from."
+            )
         if refused:
             raise refuse(file, f"has the argument {word!r}")
 
