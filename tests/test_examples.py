@@ -31,7 +31,7 @@ FAMILIES = {
 def test_floors_are_below_ceilings(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     example = importlib.import_module("examples.floor_and_ceiling")
     scripts = {env_id: scripts for env_id, scripts in example.SCRIPTS.items() if env_id != "SparseAnt-v0"}
-    for name, value in {"N_EPISODES": 1, "SEEDS": range(1), "SCRIPTS": scripts}.items():
+    for name, value in {"N_EPISODES": 1, "SEEDS": range(1), "RANDOM_SEEDS": range(1), "SCRIPTS": scripts}.items():
         monkeypatch.setattr(example, name, value)
     example.main("validation")
     rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]

@@ -113,10 +113,10 @@ def rivals(summary: dict[str, Any]) -> str:
             key = (row["variant"], f"`{row['explorer']}`", f"{row['env_steps']:,}")
             solved.setdefault(key, {})[place(row)] = _interval(row)
     first = summary["rows"][0]["variant"]
-    times = {first: "1", **{row["variant"]: _times(row) for row in summary["slowdowns"]}}
+    slower = {first: "1", **{row["variant"]: times(row) for row in summary["slowdowns"]}}
     places = list(dict.fromkeys(where for cells in solved.values() for where in cells))
     heads = [f"tasks solved, {where}" if where else "tasks solved" for where in places]
-    lines = [[*key, *(cells.get(where, "") for where in places), times.get(key[0], "")] for key, cells in solved.items()]
+    lines = [[*key, *(cells.get(where, "") for where in places), slower.get(key[0], "")] for key, cells in solved.items()]
     return markdown_table(["method", "explorer", "env steps", *heads, f"times the env steps of {first}"], lines) + "\n"
 
 
@@ -145,25 +145,31 @@ def differences(summaries: dict[str, dict[str, Any]], methods_of: dict[str, tupl
             few = f", {n_runs} run{'s' * (n_runs > 1)}" if n_runs < MIN_RUNS else ""
             cells = [by_place.get((explorer, ""), "") for explorer in explorers]
             further = f"{by_place[explorers[0], away[-1]]} ({away[-1]})" if away else ""
-            lines.append([rows[0]["env"], f"`{method}`{few}", *cells, further, "" if name in PASSED else _times(slowdown)])
+            lines.append([rows[0]["env"], f"`{method}`{few}", *cells, further, "" if name in PASSED else times(slowdown)])
     # Without columns that say nothing
     shown = [column for column in zip(*lines, strict=True) if any(column[1:]) or len(lines) == 1]
     head, *body = zip(*shown, strict=True)
     return markdown_table(head, body) + "\n"
 
 
-def _times(row: dict[str, Any]) -> str:
-    """How many times as many. Runs that never solved enough count as if with one more evaluation, and have no upper limit."""
-    if row["low"] is None:
-        return ""
-    if row["high"] is not None:
-        return f"{row['iqm']:.1f} [{row['low']:.1f}, {row['high']:.1f}]"
-    return f"≥ {row['iqm']:.1f} [{row['low']:.1f}, ∞), {row['n_unsolved']} of {row['n_seeds']} never"
+def times(row: dict[str, Any]) -> str:
+    """
+    :param row: of the slowdowns of a ``summary.json``
+    :return: how many times as many env steps, or nothing where it may be any smaller and any larger; a single run has no
+        interval
+    """
+    if row["at_most"] and row["at_least"]:
+        return "at its first evaluation" if row["n_at_first"] == row["n_seeds"] else ""
+    sign = "≤ " if row["at_most"] else "≥ " if row["at_least"] else ""
+    low, high = ("" if row[end] is None else f"{row[end]:.1f}" for end in ("low", "high"))
+    interval = f" [{low or 0}, {f'{high}]' if high else '∞)'}" if low or high else ""
+    never = f", {row['n_unsolved']} of {row['n_seeds']} never" if row["n_unsolved"] else ""
+    return f"{sign}{row['iqm']:.1f}{interval}{never}"
 
 
 def _interval(row: dict[str, Any]) -> str:
     if row["metric"] == "success_rate":
-        return f"{row['iqm']:.0%} [{row['low']:.0%}, {row['high']:.0%}]"
+        return f"{row['iqm']:.0%}" + ("" if row["low"] is None else f" [{row['low']:.0%}, {row['high']:.0%}]")
     return numbers(row, 1)
 
 

@@ -51,8 +51,13 @@ class Runs(NamedTuple):
 
     @property
     def n_unsolved(self) -> int:
-        """Runs that never solved enough of the validation tasks."""
+        """Runs that never solved enough of the validation tasks: how much later they would have is not known."""
         return sum(not is_solved(raw).any() for raw in self.raws)
+
+    @property
+    def n_at_first(self) -> int:
+        """Runs that did at their first evaluation: how much sooner they would have been seen to is not known."""
+        return sum(bool(is_solved(raw)[0]) for raw in self.raws)
 
     def about(self, evaluation: Evaluation) -> dict[str, Any]:
         """What a number is of."""
@@ -104,7 +109,7 @@ def _rows(runs: Runs) -> Iterator[dict[str, Any]]:
         for metric in [name for name in METRICS if evaluation == in_training or name not in OF_TRAINING]:
             interval: dict[str, Any] = _rounded(iqm_interval(scores(runs.raws, metric, evaluation.name)))
             if metric in TIMES:
-                interval |= _limits(interval, "high", runs)
+                interval |= _limits(at_most=runs.n_at_first, at_least=runs.n_unsolved)
             yield {**runs.about(evaluation), "metric": metric, **interval, **means}
 
 
@@ -118,18 +123,19 @@ def _differences(first: Runs, other: Runs) -> Iterator[dict[str, Any]]:
 
 
 def _slowdown(first: Runs, other: Runs) -> dict[str, Any]:
-    """How many times the env steps of the first variant the other needs to solve enough of the validation tasks, or more."""
+    """How many times the env steps of the first variant the other needs to solve enough of the validation tasks."""
     steps = [np.log(scores(runs.raws, STEPS, runs.in_training.name)) for runs in (other, first)]
     estimate, low, high = np.exp(iqm_difference(*steps))
-    about = other.about(other.in_training)
     interval: dict[str, Any] = _rounded((estimate, low, high))
-    limits = {**_limits(interval, "low", first), **_limits(interval, "high", other)}
-    return {**about, "of": first.cells[0].variant, "metric": STEPS, **interval, **limits, "n_unsolved": other.n_unsolved}
+    bounds = {"at_most": other.n_at_first + first.n_unsolved > 0, "at_least": other.n_unsolved + first.n_at_first > 0}
+    numbers = {"n_unsolved": other.n_unsolved, "n_at_first": other.n_at_first}
+    about = {**other.about(other.in_training), "of": first.cells[0].variant, "metric": STEPS}
+    return {**about, **interval, **_limits(**bounds), **bounds, **numbers}
 
 
-def _limits(interval: dict[str, Any], end: str, runs: Runs) -> dict[str, Any]:
-    """How much later than the budget a run would have solved enough is not known, so then there is no such limit."""
-    return {end: None if runs.n_unsolved else interval[end]}
+def _limits(at_most: float, at_least: float) -> dict[str, None]:
+    """The ends that an interval does not have, as its number may be any smaller, or any larger."""
+    return {**({"low": None} if at_most else {}), **({"high": None} if at_least else {})}
 
 
 def _explorer_differences(runs: Runs) -> Iterator[dict[str, Any]]:
@@ -141,9 +147,11 @@ def _explorer_differences(runs: Runs) -> Iterator[dict[str, Any]]:
             yield {**runs.about(evaluation), "of": first.explorer, "metric": RETURN, **interval}
 
 
-def _rounded(interval: tuple[float, float, float]) -> dict[str, float]:
+def _rounded(interval: tuple[float, float, float]) -> dict[str, Any]:
+    """None for an end that is NaN, for which JSON has no number."""
     # adding 0 turns -0 into 0
-    return {key: round(value, 6) + 0.0 for key, value in zip(("iqm", "low", "high"), interval, strict=True)}
+    numbers = zip(("iqm", "low", "high"), interval, strict=True)
+    return {key: None if np.isnan(value) else round(value, 6) + 0.0 for key, value in numbers}
 
 
 def check(results: dict[Cell, Path]) -> None:

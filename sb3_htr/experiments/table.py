@@ -19,7 +19,7 @@ def columns(summary: dict[str, Any]) -> dict[str, str]:
     """
     n_episodes = summary["rows"][0]["n_episodes"]
     # A family that tells no successes has none
-    has_successes = any(row["metric"] == "success_rate" and row["high"] > 0 for row in summary["rows"])
+    has_successes = any(row["metric"] == "success_rate" and (row["high"] or row["iqm"]) > 0 for row in summary["rows"])
     shown = COLUMNS if has_successes else ("last_episode_return",)
     return {metric: COLUMNS[metric].format(n_episodes=n_episodes) for metric in shown}
 
@@ -51,8 +51,10 @@ def table(summary: dict[str, Any]) -> str:
     env_steps = " / ".join(f"{n:,}" for n in sorted({row["env_steps"] for row in rows}))
     about = f"{rows[0]['env']}, {env_steps} env steps, {_runs(rows)}."
     later = summary["evaluation_commit"]
+    fewest = min(row["n_seeds"] for row in rows)
     # Interquartile means of three runs trim none
-    middle = "IQM over runs (of three or fewer, their mean)" if min(row["n_seeds"] for row in rows) <= 3 else "IQM over runs"
+    of_few = ["of three or fewer, their mean"] * (fewest <= 3) + ["of one, no interval"] * (fewest == 1)
+    middle = f"IQM over runs ({'; '.join(of_few)})" if of_few else "IQM over runs"
     commits = summary["commit"] if later == summary["commit"] else f"{summary['commit']}, evaluated by {later}"
     return (
         f"{markdown_table(head, body)}\n\n{about} Final models on the test tasks: {middle}, "
@@ -96,8 +98,8 @@ def numbers(row: dict[str, Any], digits: int) -> str:
     """
     :param row: of a ``summary.json``
     :param digits: after the point
-    :return: IQM and interval
+    :return: IQM and interval, which a single run has not
     """
     # Adding 0 turns -0 into 0
-    iqm, low, high = (f"{round(row[key], digits) + 0.0:.{digits}f}" for key in ("iqm", "low", "high"))
-    return f"{iqm} [{low}, {high}]"
+    iqm, *ends = (f"{round(row[key], digits) + 0.0:.{digits}f}" for key in ("iqm", "low", "high") if row[key] is not None)
+    return f"{iqm} [{', '.join(ends)}]" if ends else iqm

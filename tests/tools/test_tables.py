@@ -5,7 +5,28 @@ from typing import Any
 
 import pytest
 from benchmark_tables import summary
-from tables import fill, rivals
+from tables import fill, rivals, times
+
+
+def slowdown(variant: str, *, low: float | None = None, high: float | None = None, **values: Any) -> dict[str, Any]:
+    counts = {"n_seeds": 5, "n_unsolved": 0, "n_at_first": 0, "at_most": False, "at_least": False}
+    return {"variant": variant, "iqm": 3.0, "low": low, "high": high, **counts, **values}
+
+
+@pytest.mark.parametrize(
+    "row, shown",
+    [
+        (slowdown("", low=2.0, high=4.0), "3.0 [2.0, 4.0]"),
+        (slowdown("", low=2.0, at_least=True), "≥ 3.0 [2.0, ∞)"),
+        (slowdown("", high=4.0, at_most=True, n_at_first=1), "≤ 3.0 [0, 4.0]"),
+        (slowdown("", at_least=True, at_most=True, n_at_first=1), ""),
+        (slowdown("", at_least=True, at_most=True, n_at_first=5), "at its first evaluation"),
+        (slowdown("", n_seeds=1), "3.0"),
+        (slowdown("", n_seeds=1, at_least=True), "≥ 3.0"),
+    ],
+)
+def test_what_is_not_known_of_a_ratio_is_not_shown(row: dict[str, Any], shown: str) -> None:
+    assert times(row) == shown
 
 
 def test_rivals_are_compared_with_the_first_method() -> None:
@@ -18,7 +39,7 @@ def test_rivals_are_compared_with_the_first_method() -> None:
         *(row("slow", "last_episode_return", 5.0), row("slow", "success_rate", 0.5)),
         row("untimed", "success_rate", 0.2),
     ]
-    slowdowns = [{"variant": "slow", "iqm": 3.0, "low": 2.0, "high": None, "n_unsolved": 1, "n_seeds": 5}]
+    slowdowns = [slowdown("slow", at_least=True, n_unsolved=1, low=2.0)]
     assert [line.strip("| ").split(" | ") for line in rivals({"rows": rows, "slowdowns": slowdowns}).splitlines()] == [
         ["method", "explorer", "env steps", "tasks solved", "tasks solved, goal distance 2", "times the env steps of mine"],
         ["---"] * 6,

@@ -18,7 +18,8 @@ def iqm_interval(scores: np.ndarray) -> Interval:
     seeds, and tasks, which are the same for all runs, as they were when they were measured.
 
     :param scores: (n_runs,) one score per run, or (n_runs, n_eval_seeds, n_tasks)
-    :return: interquartile mean over runs, and its 95 % hierarchical bootstrap interval
+    :return: interquartile mean over runs, and its 95 % hierarchical bootstrap interval; NaN for the ends of a single run's,
+        which says nothing of others
     """
     scores, rng = _as_grid(scores), np.random.default_rng(0)
     return _interval(_iqm(scores), _resample(scores, _draw_tasks(scores, rng), rng))
@@ -28,7 +29,8 @@ def iqm_difference(scores: np.ndarray, reference: np.ndarray) -> Interval:
     """
     :param scores: as of :func:`iqm_interval`
     :param reference: the same of another method, with runs of its own, on the same tasks
-    :return: difference of the interquartile means over runs, and its 95 % hierarchical bootstrap interval
+    :return: difference of the interquartile means over runs, and its 95 % hierarchical bootstrap interval; NaN for its ends
+        where either has a single run
     """
     scores, reference, rng = _as_grid(scores), _as_grid(reference), np.random.default_rng(0)
     tasks = _draw_tasks(scores, rng)
@@ -51,8 +53,10 @@ def _draw_tasks(scores: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _resample(scores: np.ndarray, tasks: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """(REPS,), interquartile means of bootstrap samples."""
+    """(REPS,), interquartile means of bootstrap samples; NaN of a single run."""
     n_runs, n_seeds, _ = scores.shape
+    if n_runs == 1:
+        return np.full(REPS, np.nan)
     over_tasks = scores @ tasks.T
     run = rng.integers(n_runs, size=(REPS, n_runs, 1))
     seed = rng.integers(n_seeds, size=(REPS, n_runs, n_seeds))
