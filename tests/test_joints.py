@@ -466,5 +466,55 @@ def test_rows_of_elsewhere_need_rewards(tiny_pearl: MakePEARL) -> None:
     ranges, tasks = np.array([[0, 20]]), np.zeros((1, 2), dtype=np.float32)
     draw = HindsightDraw(buffer.episodes, ranges, ranges, tasks, is_relabelled=False, elsewhere=0.5)
     draw.check(1, 2)
+    draw._replace(context=ranges.astype(np.uint64)).check(1, 2)
     with pytest.raises(ValueError, match=r"elsewhere of a HindsightDraw is 0.5, and what is drawn there has the rewards of"):
         draw._replace(is_relabelled=True).check(1, 2)
+
+
+class Idle(RandomTrainingTask):
+    """Draws nothing."""
+
+    def draw(self, tasks: Any) -> HindsightDraw:
+        super().draw(tasks)
+        return None  # type: ignore[return-value]
+
+
+class Unbound(RandomTrainingTask):
+    """Does not call what it is derived from."""
+
+    def bind(self, buffer: Any) -> None:
+        self.mine = buffer
+
+
+class Hoarder(RandomTrainingTask):
+    """Keeps episodes, and all that it knows in arrays."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.kept: list[Any] = []
+
+    def on_episode(self, task: int, episode: Any) -> None:
+        self.kept.append((episode, episode.copy()))
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"n": {"episodes": np.zeros(1)}}
+
+
+def test_a_relabeller_that_draws_nothing_or_is_not_bound_is_told_of(tiny_pearl: MakePEARL) -> None:
+    with pytest.raises(ValueError, match="draw of Idle returned a NoneType, expected a HindsightDraw"):
+        tiny_pearl(replay_buffer_kwargs={"relabeller": Idle()}).learn(ROLLOUT)
+    with pytest.raises(ValueError, match=r"bind of Unbound does not call super\(\).bind\(buffer\)"):
+        tiny_pearl(replay_buffer_kwargs={"relabeller": Unbound()})
+
+
+def test_a_relabeller_may_keep_episodes_and_not_change_them(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    model = tiny_pearl(replay_buffer_kwargs={"relabeller": Hoarder()}).learn(2 * ROLLOUT)
+    assert model.replay_buffer is not None
+    kept = model.replay_buffer.relabeller.kept  # type: ignore[attr-defined]
+    assert len(kept) > 10 and all((episode == copied).all() for episode, copied in kept)
+    with pytest.raises(ValueError, match="read-only"):
+        kept[0][0][:] = 0
+    with pytest.raises(
+        ValueError, match=r"state_dict\(\) of Hoarder cannot be saved: \['n'\]\['episodes'\] is a numpy.ndarray"
+    ):
+        model.save_replay_buffer(tmp_path / "replay")

@@ -3,6 +3,7 @@
 import json
 import os
 import warnings
+from collections import OrderedDict
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -18,8 +19,34 @@ STATE, MANIFEST = "state.pt", "manifest.json"
 CHECKPOINTS = "checkpoints"
 
 
+# What is read again without running code: these types themselves, as a subclass is written by its name
+LEAVES = (bool, int, float, complex, str, bytes, type(None))
+
+
 class DamagedCheckpoint(ValueError):
     """A folder that cannot be read, with the reason."""
+
+
+def check_state(owner: str, value: Any, place: str = "") -> None:
+    """
+    :param owner: whose state it is, for the message
+    :param value: the state, or a part of it
+    :param place: of the part
+    :raises ValueError: for what could not be read again, as an array of numpy
+    """
+    if type(value) in (dict, OrderedDict):
+        for key, part in value.items():
+            check_state(owner, key, f"{place}, a key,")
+            check_state(owner, part, f"{place}[{key!r}]")
+    elif type(value) in (list, tuple, set):
+        for i, part in enumerate(value):
+            check_state(owner, part, f"{place}[{i}]")
+    elif not isinstance(value, th.Tensor) and type(value) not in LEAVES:
+        kind = f"{type(value).__module__}.{type(value).__qualname__}"
+        raise ValueError(
+            f"The state_dict() of {owner} cannot be saved: {place or 'it'} is a {kind}. It may hold tensors (torch.from_numpy "
+            "makes one of an array), numbers of Python, texts and None, in lists, tuples and dicts."
+        )
 
 
 def write_checkpoint(folder: str | os.PathLike[str], state: dict[str, Any]) -> None:
@@ -27,7 +54,9 @@ def write_checkpoint(folder: str | os.PathLike[str], state: dict[str, Any]) -> N
     :param folder: to make; its files appear all at once or not at all
     :param state: nested dicts, lists and tuples of tensors, numbers, strings, None
     :raises OSError: if it cannot be written; nothing is left behind
+    :raises ValueError: for a state that could not be read again
     """
+    check_state("this training", state)
     with atomic_path(folder) as temporary:
         temporary.mkdir()
         with open(temporary / STATE, "wb") as file:  # whose errors are those of the system, unlike torch's own

@@ -1,6 +1,5 @@
 """Writes checkpoints from which a training goes on as if it had never stopped."""
 
-import io
 import re
 import shutil
 import time
@@ -10,13 +9,12 @@ from pathlib import Path
 from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
-import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import TensorBoardOutputFormat
 
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.callback import parts_of
-from sb3_htr.common.checkpoint import CHECKPOINTS, checkpoints, n_steps_at, write_checkpoint
+from sb3_htr.common.checkpoint import CHECKPOINTS, check_state, checkpoints, n_steps_at, write_checkpoint
 from sb3_htr.common.errors import reason, training_goes_on
 from sb3_htr.common.settings import check_numbers, keywords_of
 
@@ -215,7 +213,7 @@ class CheckpointCallback(BaseCallback):
         if self.n_calls - self._last_calls >= self.save_freq or self.stopping:
             self._save()
         elif self.n_calls == 0:
-            self._callback_states()  # one that cannot be saved says so before any work is done
+            self._state()  # what cannot be saved says so before any work is done
 
     def _save(self) -> None:
         folder = self.run / CHECKPOINTS / f"{self.num_timesteps}_steps"
@@ -277,15 +275,6 @@ class CheckpointCallback(BaseCallback):
             state = None if callback is self else numbers
             if isinstance(callback, HasState):
                 state = callback.state_dict()
-            file = io.BytesIO()
-            try:
-                th.save(state, file)
-                file.seek(0)
-                th.load(file, weights_only=True)
-            except Exception as error:
-                raise ValueError(
-                    f"The state_dict() of {type(callback).__name__} cannot be saved: it may hold tensors, numbers of Python, "
-                    "texts and None, in lists, tuples and dicts."
-                ) from error
+            check_state(type(callback).__name__, state)
             states.append({"n_calls": callback.n_calls, "state": state})
         return states

@@ -9,6 +9,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 
+from sb3_htr.common.checkpoint import check_state
 from sb3_htr.common.checks import check_has_hooks, tells_rewards
 from sb3_htr.common.family_facts import check_same_family, family_facts
 from sb3_htr.common.random_state import get_generator_state, set_generator_state, stream
@@ -18,7 +19,7 @@ from sb3_htr.common.type_aliases import MultiTaskSamples, RewardLabels, TaskFami
 from sb3_htr.htr.episode_store import EpisodeStore
 from sb3_htr.htr.groups import ascending, first_rows, stratified_draw
 from sb3_htr.htr.n_step import n_step_returns, steps_ahead
-from sb3_htr.htr.relabel import RELABELLERS, Relabeller
+from sb3_htr.htr.relabel import RELABELLERS, HindsightDraw, Relabeller
 from sb3_htr.htr.reward_hook import check_achieved, check_returned_rewards, check_rewards_told
 from sb3_htr.htr.transitions import Transitions
 
@@ -115,6 +116,8 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         # A copy: what the user gave holds settings, and can be given to another buffer
         self.relabeller = copy.deepcopy(make("relabeller", relabeller, RELABELLERS, Relabeller))
         self.relabeller.bind(self)
+        if getattr(self.relabeller, "buffer", None) is not self:
+            raise ValueError(f"bind of {type(self.relabeller).__name__} does not call super().bind(buffer), which it needs.")
         # Told of every finished episode: the training task that it was collected on, and its transitions
         self.episode_listeners: list[Callable[[int, np.ndarray], None]] = []
         if relabel_probability > 0:
@@ -223,8 +226,11 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             episode = self._open[ended, : self._open_length[ended]]
             self._check_achieved(episode[-1:], infos[ended], int(ended))
             self.episodes.add(int(task[ended]), episode)
+            # One that keeps it must not see the next episode in its place, nor change what the others are told
+            finished = episode.copy()
+            finished.flags.writeable = False
             for listener in self.episode_listeners:
-                listener(int(task[ended]), episode)
+                listener(int(task[ended]), finished)
             self._open_length[ended] = 0
 
     def _check_achieved(self, last: np.ndarray, info: dict[str, Any], env: int) -> None:
@@ -265,10 +271,13 @@ class MultiTaskReplayBuffer(ReplayBuffer):
     def state_dict(self) -> dict[str, Any]:
         """
         :return: all complete episodes and the random generators, for :meth:`load_state_dict`
+        :raises ValueError: if the relabeller's could not be read again
         """
+        relabeller = self.relabeller.state_dict()
+        check_state(type(self.relabeller).__name__, relabeller)
         return {
             "episodes": self.episodes.state_dict(),
-            "relabeller": self.relabeller.state_dict(),
+            "relabeller": relabeller,
             "relabelled_by": self._relabelled_by,
             "task_family": family_facts(self.task_family),
             "random": [get_generator_state(generator) for generator in (self._rng, self.relabel_rng)],
@@ -351,9 +360,8 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         context_source, batch_source = index.latest_episodes(tasks, self.context_episodes), index.all_episodes(tasks)
         reward_task = self.task_family.train_tasks[tasks].astype(np.float32)
         relabelled = self.relabel_rng.random(meta_batch_size) < self.relabel_probability
-        hindsight = self.relabeller.draw(tasks[relabelled]) if relabelled.any() else None
+        hindsight = self._draw_hindsight(tasks[relabelled]) if relabelled.any() else None
         if hindsight is not None:
-            hindsight.check(int(relabelled.sum()), reward_task.shape[1])
             context_source[relabelled], batch_source[relabelled] = hindsight.context, hindsight.batch
             reward_task[relabelled] = hindsight.tasks
         context, n_context = stratified_draw(self._rng, context_source, context_size)
@@ -397,6 +405,15 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             unrewarded=np.logical_and.reduceat(beside <= ROUNDING, first_rows(n_batch)),
             labels=self._label(first, context_rows, n_context, reward_task, n_labelled),
         )
+
+    def _draw_hindsight(self, tasks: np.ndarray) -> HindsightDraw:
+        """What the relabeller says of rows of these training tasks."""
+        drawn = self.relabeller.draw(tasks)
+        if not isinstance(drawn, HindsightDraw):
+            name = type(self.relabeller).__name__
+            raise ValueError(f"draw of {name} returned a {type(drawn).__name__}, expected a HindsightDraw.")
+        drawn.check(len(tasks), self.task_family.train_tasks.shape[1])
+        return drawn
 
     def _draw_elsewhere(self, virtual: np.ndarray, of_store: np.ndarray, share: float) -> None:
         """A share of the rows that are of the relabeller's store: any of the replay in their place."""

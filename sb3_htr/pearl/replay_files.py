@@ -29,7 +29,8 @@ class ReplayFiles(Resumable, OffPolicyAlgorithm):
         Save replay and what was learnt of it, as plain arrays.
 
         :param path: file, ``.pt`` is added to a name without suffix; it is replaced at the end or not at all
-        :raises ValueError: for a model that was loaded without an env
+        :raises ValueError: for a model that was loaded without an env, or a relabeller of one's own whose ``state_dict`` could
+            not be read again
         """
         state = self._replay_state()
         if isinstance(path, io.IOBase):

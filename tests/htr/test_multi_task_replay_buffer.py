@@ -327,7 +327,9 @@ def test_elsewhere_is_the_replay_whatever_the_store_of_a_relabeller() -> None:
         ({"context": np.zeros((30, 2))}, "context of a HindsightDraw has shape .* and dtype float64, expected whole numbers"),
         ({"batch": np.tile([5, 5], (30, 1))}, "batch of a HindsightDraw has a range that is empty or not within the 20 rows"),
         ({"batch": np.tile([0, 21], (30, 1))}, "batch of a HindsightDraw has a range that is empty or not within the 20 rows"),
-        ({"tasks": np.zeros(30)}, r"tasks of a HindsightDraw have shape \(30,\), expected \(30, 2\)"),
+        ({"tasks": np.zeros(30)}, r"tasks of a HindsightDraw are array(.|\n)*, expected finite numbers of shape \(30, 2\)"),
+        ({"tasks": np.full((30, 2), np.nan)}, r"tasks of a HindsightDraw are array(.|\n)*nan(.|\n)*, expected finite numbers"),
+        ({"elsewhere": 2.0}, "elsewhere of a HindsightDraw is 2.0, expected a share from 0 to 1"),
     ],
 )
 def test_draws_of_a_relabeller_that_cannot_be(wrong: dict[str, Any], message: str) -> None:

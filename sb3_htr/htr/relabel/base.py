@@ -55,9 +55,11 @@ class HindsightDraw(NamedTuple):
         """
         :param m: number of rows that were to be relabelled
         :param task_dim: length of a task
-        :raises ValueError: if it is not for so many, ranges are not within the store, or rows of elsewhere would keep the
-            rewards of other tasks
+        :raises ValueError: if it is not for so many, ranges are not within the store, tasks are not finite, or rows of
+            elsewhere would keep the rewards of other tasks
         """
+        if not 0 <= self.elsewhere <= 1:
+            raise ValueError(f"elsewhere of a HindsightDraw is {self.elsewhere}, expected a share from 0 to 1.")
         if self.is_relabelled and self.elsewhere:
             raise ValueError(
                 f"elsewhere of a HindsightDraw is {self.elsewhere}, and what is drawn there has the rewards of other tasks: "
@@ -65,7 +67,8 @@ class HindsightDraw(NamedTuple):
             )
         n_rows = len(self.store.index().rows)
         for name, ranges in (("context", self.context), ("batch", self.batch)):
-            if ranges.shape != (m, 2) or ranges.dtype.kind != "i":
+            ranges = np.asarray(ranges)
+            if ranges.shape != (m, 2) or ranges.dtype.kind not in "iu":
                 raise ValueError(
                     f"{name} of a HindsightDraw has shape {ranges.shape} and dtype {ranges.dtype}, expected whole numbers, "
                     f"({m}, 2)."
@@ -74,8 +77,10 @@ class HindsightDraw(NamedTuple):
                 raise ValueError(
                     f"{name} of a HindsightDraw has a range that is empty or not within the {n_rows} rows of its store."
                 )
-        if self.tasks.shape != (m, task_dim):
-            raise ValueError(f"tasks of a HindsightDraw have shape {self.tasks.shape}, expected ({m}, {task_dim}).")
+        if np.shape(self.tasks) != (m, task_dim) or not np.isfinite(self.tasks).all():
+            raise ValueError(
+                f"tasks of a HindsightDraw are {self.tasks!r:.200}, expected finite numbers of shape ({m}, {task_dim})."
+            )
 
 
 class Relabeller(ABC):
@@ -101,10 +106,11 @@ class Relabeller(ABC):
 
     def on_episode(self, task: int, episode: np.ndarray) -> None:
         """
-        Called for each finished episode, after it was stored.
+        Called for each finished episode, after it was stored; not if K is 0.
 
         :param task: index of the training task that it was collected on
-        :param episode: (length, width) float32, its transitions, see :class:`sb3_htr.htr.transitions.Transitions`
+        :param episode: (length, width) float32, its transitions, a copy that cannot be written to; columns are those of
+            ``buffer.transitions``, a :class:`sb3_htr.htr.transitions.Transitions`
         """
 
     @abstractmethod
@@ -125,7 +131,8 @@ class Relabeller(ABC):
 
     def state_dict(self) -> dict[str, Any]:
         """
-        :return: tensors, numbers and strings, for :meth:`load_state_dict`
+        :return: tensors, numbers and strings, in dicts and lists, for :meth:`load_state_dict`; an array of numpy is refused
+            when it is saved
         """
         return {}
 
