@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import gymnasium as gym
 import matplotlib.pyplot as plt
@@ -23,15 +23,18 @@ from helpers.experience import by_task
 from helpers.runs import run_folder, train_arguments
 from htr_envs import Dynamics, DynamicsEnv, DynamicsVectorEnv, TaskFamily, at_step, check_reward_type, check_task_env
 from sb3_htr import PEARL, evaluate_adaptation
-from sb3_htr.adaptation import Explorer, Step
+from sb3_htr.adaptation import Explorer, Step, register_explorer
+from sb3_htr.adaptation.explorers import EXPLORERS, to_explorer
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
 from sb3_htr.experiments import grid
-from sb3_htr.htr import Relabeller
+from sb3_htr.htr import Relabeller, register_relabeller
 from sb3_htr.htr.relabel import RELABELLERS, HindsightDraw
-from sb3_htr.pearl.encoder import ContextEncoder
+from sb3_htr.pearl import register_encoder
+from sb3_htr.pearl.encoder import ENCODERS, ContextEncoder
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run import method
 from sb3_htr.zoo.run.agents import agent_at
+from sb3_htr.zoo.run.algorithm import ALGORITHMS
 from sb3_htr.zoo.run.record import RECORD
 from sb3_htr.zoo.run.shipped import hyperparams_file
 
@@ -361,10 +364,45 @@ def test_an_env_family(heights: str, tiny_pearl: MakePEARL) -> None:
 
 # A module of somebody's own
 OWN = """
+from dataclasses import dataclass
+
 import matplotlib.pyplot as plt
+from sb3_htr import PEARL
+from sb3_htr.adaptation import Aggregate, register_explorer
 from sb3_htr.experiments.grid import EXPERIMENTS, Experiment, Variant, by
+from sb3_htr.htr import SingleEpisodeRelabelling, register_relabeller
+from sb3_htr.pearl import register_encoder
+from sb3_htr.pearl.encoder import ContextEncoder
+from sb3_htr.zoo.run.algorithm import register_algorithm
 from sb3_htr.zoo.run.method import register_method
 
+@register_explorer
+@dataclass
+class Wide(Aggregate):
+    width: float = 1.0
+
+    def start(self):
+        super().start()
+        self.z = self.width * self.z
+
+@register_relabeller
+class Again(SingleEpisodeRelabelling):
+    pass
+
+@register_encoder
+class Doubtful(ContextEncoder):
+    def posterior(self, state):
+        mean, variance = super().posterior(state)
+        return mean, 2 * variance
+
+class Mild(PEARL):
+    def __init__(self, *args, mildness=1.0, **kwargs):
+        self.mildness = mildness
+        super().__init__(*args, **kwargs)
+
+register_algorithm("mild-pearl", Mild, "pearl.yml", "It is milder.")
+of_one = {"relabeller": "Again", "relabel_probability": 0.5, "rl_reward_type": "sparse"}
+register_method("mild", about="Mild.", algorithm="mild-pearl", **of_one, train_explorer="wide", explorer="wide")
 register_method(
     "half-half",
     about="PEARL that relabels every other time",
@@ -384,6 +422,10 @@ def draw(results, path):
 EXPERIMENTS["toy"] = Experiment(
     "toy", "A toy.", "SparsePointRobot-v0", 480, (row,), 1, evaluations=by(("aggregate",)), figure=draw
 )
+settings = {"mildness": 0.5, "explorer": {"width": 2.0}}
+networks = {"policy_kwargs": {**networks["policy_kwargs"], "encoder_class": "Doubtful"}}
+mild = Variant("mild", "mild", {**small, **settings, **networks})
+EXPERIMENTS["mild"] = Experiment("mild", "Mild.", "SparsePointRobot-v0", 480, (mild,), 1, evaluations=by(("wide",)))
 """
 
 
@@ -392,11 +434,15 @@ def own_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]
     """A module to be named on the command line, and forgotten afterwards."""
     (tmp_path / "half_half.py").write_text(OWN)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setitem(grid.EXPERIMENTS, "toy", cast(Any, None))
+    registries: list[dict[str, Any]] = [grid.EXPERIMENTS, EXPLORERS, RELABELLERS, ENCODERS, ALGORITHMS]
+    before = [dict(registry) for registry in registries]
     monkeypatch.setattr("sb3_htr.experiments.protocol.EVAL_SEEDS", (1,))
     yield "half_half"
     sys.modules.pop("half_half", None)
     method.methods.cache_clear()
+    for registry, content in zip(registries, before, strict=True):
+        registry.clear()
+        registry.update(content)
 
 
 def test_a_method(own_module: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -446,6 +492,47 @@ def test_an_experiment(own_module: str, tmp_path: Path) -> None:
     summary = json.loads((tmp_path / "results" / "summary.json").read_text())
     assert {row["variant"] for row in summary["rows"]} == {"half"}
     assert plt.imread(tmp_path / "results" / "toy.png").shape[:2] == (1, 1), "by its own figure, of one result"
+
+
+def test_a_method_all_of_whose_parts_are_ones_own(own_module: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Algorithm, explorer, relabeller and encoder: commands read its models without --trust, as the user has imported them."""
+    packages, runs = ["--gym-packages", own_module], tmp_path / "runs"
+    where = ["--runs", str(runs), "-o", str(tmp_path / "results")]
+    assert main(["experiment", "mild", *packages, *where, "--jobs", "1"]) == 0
+    agent = agent_at(runs / "mild" / "mild-seed1", "last")
+    model = agent.load()
+    assert isinstance(model, PEARL) and type(model).__name__ == "Mild"
+    assert (type(model.explorer).__name__, model.explorer.width) == ("Wide", 2.0)  # type: ignore[attr-defined]
+    assert type(model.policy.encoder).__name__ == "Doubtful"
+    assert type(model.replay_buffer.relabeller).__name__ == "Again"  # type: ignore[union-attr]
+    few = ["--n-tasks", "1", "--n-episodes", "1", "--no-render"]
+    assert main(["enjoy", str(agent.path), *packages, *few]) == 0
+    cards = tmp_path / "cards"
+    export = ["export", str(agent.path), *packages, "--n-episodes", "1"]
+    assert main([*export, "-o", str(cards / "plain")]) == 0
+    card = (cards / "plain" / "README.md").read_text()
+    assert "from half_half import Mild\n" in card and "It is milder." in card and "--trust" not in card
+    del EXPLORERS["wide"]
+    with pytest.raises(ValueError, match=r"its explorer is a class of its own that is not registered \(sb3_htr"):
+        agent.load()
+    assert main([*export, "--trust", "-o", str(cards / "trusted")]) == 0
+    assert "--gym-packages half_half --trust\n" in (cards / "trusted" / "README.md").read_text()
+
+
+def test_a_name_is_of_one_class() -> None:
+    @dataclass
+    class Prior(Lattice):
+        pass
+
+    for use in (register_explorer, lambda kind: to_explorer(kind())):
+        with pytest.raises(
+            ValueError, match=r"explorer tests\.test_joints\..*Prior has the name 'prior', which is that of sb3"
+        ):
+            use(Prior)
+    with pytest.raises(ValueError, match=r"What is registered as relabeller is <class .*, expected a class derived from"):
+        register_relabeller(Prior)  # type: ignore[type-var]
+    with pytest.raises(ValueError, match="expected a class derived from torch"):
+        register_encoder(Prior)  # type: ignore[type-var]
 
 
 class Quiet(Lattice):

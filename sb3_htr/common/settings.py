@@ -47,6 +47,42 @@ def make(setting: str, value: Any, kinds: Mapping[str, Callable[..., Kind]], bas
     return kinds[name](**settings)
 
 
+def register(
+    setting: str, kind: type[Kind], base: type, kinds: dict[str, Any], spell: Callable[[str], str] = str
+) -> type[Kind]:
+    """
+    Let a setting name a class of one's own.
+
+    :param setting: that chooses such a class, for messages
+    :param kind: the class
+    :param base: what it is to be derived from
+    :param kinds: classes by their names, to which it is added; again, if a notebook defines it again
+    :param spell: makes the name of that of the class
+    :return: the class, so that this can decorate it
+    :raises ValueError: for what is no such class, or a name that another one has
+    """
+    check_class(f"What is registered as {setting}", kind, base)
+    name = spell(kind.__name__)
+    check_own_name(setting, kind, kinds.get(name, kind), name)
+    kinds[name] = kind
+    return kind
+
+
+def check_own_name(setting: str, kind: type, known: type, name: str) -> None:
+    """
+    :param setting: that chooses such a class, for messages
+    :param kind: a class
+    :param known: the one that the setting has under this name
+    :param name: of both
+    :raises ValueError: if they are two
+    """
+    if (kind.__module__, kind.__qualname__) != (known.__module__, known.__qualname__):
+        raise ValueError(
+            f"The {setting} {kind.__module__}.{kind.__qualname__} has the name {name!r}, which is that of "
+            f"{known.__module__}.{known.__qualname__}: give the class another name."
+        )
+
+
 def check_numbers(**numbers: tuple[Any, float] | tuple[Any, float, float]) -> None:
     """
     :param numbers: name of a setting, its value, and the smallest and, if there is one, the largest value that it may have,

@@ -7,6 +7,7 @@ from sb3_htr.htr.relabel import (
     HindsightTaskStrategy,
     Relabeller,
     SingleEpisodeRelabelling,
+    register_relabeller,
 )
 
 __all__ = [
@@ -18,4 +19,5 @@ __all__ = [
     "MultiTaskReplayBuffer",
     "Relabeller",
     "SingleEpisodeRelabelling",
+    "register_relabeller",
 ]

@@ -1,5 +1,7 @@
 """Probabilistic context encoder: q(z | c) as a product of independent Gaussian factors (PEARL, section 4)."""
 
+from typing import TypeVar
+
 import torch as th
 from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
@@ -7,7 +9,9 @@ from torch.nn import functional as F
 
 from sb3_htr.common.linear import with_fast_layers
 from sb3_htr.common.segments import segment_sum
-from sb3_htr.common.settings import check_class
+from sb3_htr.common.settings import check_class, register
+
+SomeModule = TypeVar("SomeModule", bound=nn.Module)
 
 # Smallest variance of a factor, as in PEARL's reference implementation
 MIN_VARIANCE = 1e-7
@@ -101,6 +105,20 @@ class PriorFactorEncoder(ContextEncoder):
 
 #: Encoders by the names that YAML files have for them
 ENCODERS: dict[str, type[ContextEncoder]] = {encoder.__name__: encoder for encoder in (ContextEncoder, PriorFactorEncoder)}
+
+
+def register_encoder(kind: type[SomeModule]) -> type[SomeModule]:
+    """
+    Let settings and YAML files name an encoder of one's own, by the name of its class. In a module that ``--gym-packages``
+    names, it is at hand in all commands, and they read models that were saved with its name.
+
+    :param kind: a class of modules whose constructor takes what that of :class:`ContextEncoder` does, with ``empty``,
+        ``extend`` and ``posterior``
+    :return: the class, so that this can decorate it
+    :raises ValueError: for what is no such class, or has the name of another encoder
+    """
+    to_encoder_class(kind)  # type: ignore[arg-type]
+    return register("encoder_class", kind, nn.Module, ENCODERS)
 
 
 def to_encoder_class(encoder: type[ContextEncoder] | str) -> type[ContextEncoder]:

@@ -44,7 +44,13 @@ COUNTERS = ("num_timesteps", "_n_updates")
 REPLAY = ("relabel_probability", "relabeller", "rl_reward_type", "context_episodes")
 
 
-def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.device | str = "auto", **kwargs: Any) -> PEARL:
+def load_untrusted(
+    path: str | os.PathLike[str],
+    env: GymEnv | str,
+    device: th.device | str = "auto",
+    model_class: type[PEARL] = PEARL,
+    **kwargs: Any,
+) -> PEARL:
     """
     Load a model of unknown origin: weights and plain settings, without running code of the file, and in as much memory as its
     weights take.
@@ -59,17 +65,18 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
     :param env: env of a task family, as for a training, of the same spaces, which are compared with what the file says of
         them in words
     :param device: torch device
+    :param model_class: what to make of it; arguments that PEARL has not are at their defaults, or among ``kwargs``
     :param kwargs: arguments of PEARL, in place of those of the file
     :return: a model to predict, adapt and evaluate with
     :raises OSError: if there is no such file, or it cannot be opened
     :raises ValueError: if it is no such file, or its weights or spaces do not fit
     """
-    PEARL.check_names(kwargs)
+    model_class.check_names(kwargs)
     # As SB3's load does
     path = path if os.path.exists(path) else with_suffix(path, ".zip")
     try:
         data, weights = read_model(path, ("policy", "knowledge"))
-        check_is_ours("policy", data["policy_class"].get("__module__", ""))
+        _check_is_ours("policy", data["policy_class"].get("__module__", ""))
         settings: dict[str, Any] = {name: _plain(name, data[name]) for name in EXPLORERS if name not in kwargs}
         settings |= {name: data[name] for name in NUMBERS if type(data.get(name)) in (int, float)}
         settings |= {FLAG: data[FLAG]} if type(data.get(FLAG)) is bool else {}
@@ -104,7 +111,7 @@ def load_untrusted(path: str | os.PathLike[str], env: GymEnv | str, device: th.d
         kwargs[name] = {**settings.pop(name), **(kwargs.get(name) or {})}
     _check_shapes(path, weights["policy"], env, kwargs["policy_kwargs"])
     check_recorded_spaces(env, data)
-    model = PEARL("MlpPolicy", env, device=device, _init_setup_model=False, **{**settings, **kwargs})
+    model = model_class("MlpPolicy", env, device=device, _init_setup_model=False, **{**settings, **kwargs})
     # Which settings follow from: where the env has others, that is warned of
     vars(model).update({name: data[name] for name in ("max_episode_steps", "n_rollout_tasks") if type(data.get(name)) is int})
     model._setup_model()
@@ -128,24 +135,27 @@ def check_loadable(hyperparams: dict[str, Any]) -> None:
     _check_memory(hyperparams)
     for name in EXPLORERS:
         if name in hyperparams:
-            check_is_ours(name, type(explorers.to_explorer(hyperparams[name])).__module__)
+            _check_explorer(name, str(type(explorers.to_explorer(hyperparams[name]))))
 
 
-def check_is_ours(what: str, module: str) -> None:
-    """
-    :param what: class of a model is meant
-    :param module: that it is in
-    :raises Refused: if that is none of this package
-    """
+def _check_is_ours(what: str, module: str, registered: str = "") -> None:
+    """Of a class that is in ``module``, or that the user could have registered."""
     if not module.startswith("sb3_htr."):
         raise Refused(
-            f"its {what} is a class of its own, which only PEARL.load restores (on the command line, --trust), and that may "
-            "run code of the file."
+            f"its {what} is a class of its own{registered}, which only PEARL.load restores (on the command line, --trust), "
+            "and that may run code of the file."
         )
 
 
+def _check_explorer(what: str, kind: str) -> None:
+    """``kind`` is its class in words: one of this package, or one that the user has registered and a file only names."""
+    if kind not in map(str, explorers.EXPLORERS.values()):
+        registered = " that is not registered (sb3_htr.adaptation.register_explorer)"
+        _check_is_ours(what, kind.removeprefix("<class '"), registered)
+
+
 def _plain(what: str, explorer: dict[str, Any]) -> dict[str, Any]:
-    check_is_ours(what, explorer.get(TYPE, "").removeprefix("<class '"))
+    _check_explorer(what, explorer.get(TYPE, ""))
     settings = {key: value for key, value in explorer.items() if key not in (TYPE, PICKLED)}
     name = settings.get("name")
     if not isinstance(name, str) or name not in explorers.EXPLORERS:
@@ -184,9 +194,10 @@ def _check_policy_settings(given: dict[str, Any]) -> set[str]:
     # SB3 marks some with a colon; and what says how weights are learnt says nothing of those in a file
     unknown = [name for name in given if name not in (*known, "optimizer_kwargs") and not name.startswith(":")]
     if unknown:
+        registered = " of no registered name (sb3_htr.pearl.register_encoder)" if unknown[0] == "encoder_class" else ""
         raise Refused(
-            f"its policy has the setting {unknown[0]!r}, which only PEARL.load restores (on the command line, --trust), and "
-            "that may run code of the file."
+            f"its policy has the setting {unknown[0]!r}{registered}, which only PEARL.load restores (on the command line, "
+            "--trust), and that may run code of the file."
         )
     return known
 

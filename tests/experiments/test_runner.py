@@ -19,7 +19,7 @@ from helpers.disks import half_written
 from helpers.results import made_up
 from helpers.runs import OF_CELL
 from sb3_htr import PEARL, evaluate_adaptation, make_task_vec_env
-from sb3_htr.adaptation.explorers import EXPLORERS, Prior
+from sb3_htr.adaptation.explorers import Prior
 from sb3_htr.common.checkpoint import checkpoints, write_checkpoint
 from sb3_htr.common.versions import hardware
 from sb3_htr.experiments import grid
@@ -307,12 +307,6 @@ def test_plain_settings_of_a_variant_reach_its_evaluation(tmp_path: Path) -> Non
 
 def test_settings_that_could_not_be_evaluated_are_not_trained_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sb3_htr.experiments.runner.train.main", None)
-    monkeypatch.setitem(EXPLORERS, "mine", type("Mine", (Prior,), {"__module__": "mine"}))
-    (cell,) = Experiment("one", "", ENV_ID, 480, (Variant("htr-ser", "", {"train_explorer": "mine"}),), 1).cells()
-    with pytest.raises(
-        ValueError, match=r"could not be evaluated: its train_explorer is a class of its own, .* the file\. Leave"
-    ):
-        run_cell(cell, tmp_path)
     for settings, message in (
         ({"policy_kwargs": {"activation_fn": nn.Tanh}}, "its policy has the setting 'activation_fn'"),
         ({"buffer_size": 10**8}, "PEARL has no buffer_size of 100000000 here"),

@@ -86,6 +86,15 @@ def earlier_export(folder: Path, names: Sequence[str]) -> list[Path]:
     return [folder / name for name in found]
 
 
+def _needs_trust(agent: TrainedAgent, device: str) -> bool:
+    """Whether it is loaded in no other way."""
+    try:
+        dataclasses.replace(agent, trusted=False).load(device)
+    except ValueError:
+        return True
+    return False
+
+
 def main(argv: Sequence[str]) -> None:
     """The command, with its arguments."""
     description = "Write an agent as a small model file with a model card: scores after adaptation, how to load it."
@@ -124,7 +133,7 @@ def main(argv: Sequence[str]) -> None:
     if repo_id is not None and "/" not in repo_id:
         repo_id += f"/{name}"
     with atomic_path(output / CARD) as temporary:
-        temporary.write_text(model_card(record, scores, repo_id))
+        temporary.write_text(model_card(record, scores, repo_id, args.trust and _needs_trust(exported, args.device)))
     # Not before there is a new card: what an earlier export has left tells of another model
     for path in left:
         if path not in (file, output / CARD):

@@ -3,7 +3,7 @@
 import inspect
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from sb3_htr.rivals.untrusted import load_untrusted as load_untrusted_rival
 from sb3_htr.rivals.untrusted import plain_policy
 from sb3_htr.zoo.run import search_space
 from sb3_htr.zoo.run.search_space import SearchSpace
-from sb3_htr.zoo.run.shipped import hyperparams_file
+from sb3_htr.zoo.run.shipped import find_hyperparams, hyperparams_file
 from sb3_htr.zoo.run.trust import refuse
 
 # What a run trains and a command adapts
@@ -102,16 +102,16 @@ class Algorithm:
 
 
 class PEARLAlgorithm(Algorithm):
-    """PEARL, whose files can be trained on without running code of theirs."""
+    """PEARL, or a class derived from it, whose files can be trained on without running code of theirs."""
 
     def _load_untrusted(self, path: Path, record: dict[str, Any], env: gym.Env, device: str) -> Model:
-        return load_untrusted(path, env, device)
+        return load_untrusted(path, env, device, self.model_class)
 
     def check_loadable(self, hyperparams: dict[str, Any]) -> None:
         check_loadable(hyperparams)
 
     def load_to_train(self, path: str, env: VecEnv, device: th.device | str, **kwargs: Any) -> PEARL:
-        return load_untrusted(path, env, device, **kwargs)
+        return load_untrusted(path, env, device, self.model_class, **kwargs)
 
     def usual_timesteps(self, model: BaseAlgorithm) -> int:
         n_steps: int | None = getattr(model, "max_episode_steps", None)
@@ -150,7 +150,7 @@ ALGORITHMS = {
 
 def register_algorithm(
     name: str,
-    model_class: type[Rival],
+    model_class: type[Model],
     settings: str | os.PathLike[str],
     about: str,
     search_space: SearchSpace | None = None,
@@ -160,19 +160,38 @@ def register_algorithm(
     own, which ``--gym-packages`` names, it is at hand in all commands.
 
     :param name: that no other algorithm has
-    :param model_class: of its models, at the top of a module, so that others can import it
-    :param settings: path of a YAML file with hyperparameters, as ``hyperparams/rl2.yml``
+    :param model_class: of its models, at the top of a module, so that others can import it: a rival, or derived from PEARL
+    :param settings: path of a YAML file with hyperparameters, as ``hyperparams/rl2.yml``, or the name of the package's
     :param about: how an agent of it comes to know its task, a sentence for model cards
     :param search_space: what ``optimize`` searches through, None for nothing
-    :raises ValueError: for a name that is taken or cannot be that of a folder, a class that is no rival or cannot be imported
+    :raises ValueError: for a name that is taken or cannot be that of a folder, a class that is neither or cannot be
+        imported
     :raises FileNotFoundError: if there is no such file
     """
     check_folder_name("algorithm", name)
     if name in ALGORITHMS:
         raise ValueError(f"There is an algorithm {name!r} already: choose another name.")
+    if not issubclass(model_class, PEARL):
+        _check_is_whole_rival(model_class)
+    if model_class.__module__ == "__main__":
+        raise ValueError(f"{model_class.__name__} is in a script, which nobody can import: put it into a module of its own.")
+    path = Path(find_hyperparams(str(settings))).resolve()
+    if not path.is_file():
+        raise FileNotFoundError(f"There is no file {path} with hyperparameters of {name!r}.")
+    if "." in model_class.__qualname__:
+        raise ValueError(f"{model_class.__qualname__} is within something: put the class at the top of its module.")
+    # How PEARL is loaded, explores and is searched through holds for what is derived from it
+    like = ALGORITHMS["pearl"] if issubclass(model_class, PEARL) else Algorithm(name, model_class, str(path), about)
+    search_space = search_space or like.search_space
+    ALGORITHMS[name] = replace(
+        like, name=name, model_class=model_class, settings=str(path), about=about, search_space=search_space
+    )
+
+
+def _check_is_whole_rival(model_class: type[Any]) -> None:
     if not issubclass(model_class, OnPolicyRival | OffPolicyRival):
         raise ValueError(
-            f"{model_class.__name__} is no subclass of sb3_htr.rivals.on_policy.OnPolicyRival or "
+            f"{model_class.__name__} is no subclass of PEARL, sb3_htr.rivals.on_policy.OnPolicyRival or "
             "sb3_htr.rivals.off_policy.OffPolicyRival, which say what is needed."
         )
     parts = model_class.__mro__
@@ -181,14 +200,6 @@ def register_algorithm(
         raise ValueError(f"{model_class.__name__} has {library.__name__} before its mixin: class Mine(OnPolicyRival, PPO).")
     if inspect.isabstract(model_class) or not hasattr(model_class, "DEFAULT_POLICY"):
         raise ValueError(f"{model_class.__name__} is not whole: it needs a DEFAULT_POLICY, and _adaptation.")
-    if model_class.__module__ == "__main__":
-        raise ValueError(f"{model_class.__name__} is in a script, which nobody can import: put it into a module of its own.")
-    path = Path(settings).resolve()
-    if not path.is_file():
-        raise FileNotFoundError(f"There is no file {path} with hyperparameters of {name!r}.")
-    if "." in model_class.__qualname__:
-        raise ValueError(f"{model_class.__qualname__} is within something: put the class at the top of its module.")
-    ALGORITHMS[name] = Algorithm(name, model_class, str(path), about, search_space=search_space)
 
 
 def check_folder_name(what: str, name: str) -> None:

@@ -11,7 +11,7 @@ from sb3_htr.adaptation.explorers import EXPLORERS
 from sb3_htr.common.settings import check_numbers, keywords_of, name_of
 from sb3_htr.htr.relabel import RELABELLERS, TrainingTaskRelabelling
 from sb3_htr.rivals.adaptation import OwnWay
-from sb3_htr.zoo.run.algorithm import ALGORITHMS, Algorithm, check_folder_name
+from sb3_htr.zoo.run.algorithm import ALGORITHMS, Algorithm, PEARLAlgorithm, check_folder_name
 from sb3_htr.zoo.run.search_space import OF_RELABELLERS
 from sb3_htr.zoo.run.shipped import hyperparams_file
 
@@ -161,7 +161,7 @@ def methods() -> dict[str, Method]:
 
 
 def _method(name: str, about: str, algorithm: str = "pearl", **settings: Any) -> Method:
-    kind = PEARLMethod if algorithm == "pearl" else Method
+    kind = PEARLMethod if isinstance(ALGORITHMS.get(algorithm), PEARLAlgorithm) else Method
     return kind(name, " ".join(about.split()), algorithm, **settings)
 
 

@@ -37,6 +37,8 @@ LOCAL = {"-f": 1, "--log-folder": 1, "-tb": 1, "--tensorboard-log": 1, "-P": 0, 
 LOCAL |= dict.fromkeys(OF_STUDY, 1)
 # In JSON, what Python has no literal for: descriptions of objects, as <class 'torch.nn.modules.activation.Tanh'>, and numbers
 NOT_WRITTEN = re.compile(r'"<|NaN|Infinity')
+OF_COMMANDS = "The commands of `sb3-htr` read the weights and plain settings alone."
+OF_TRUST = "By `--trust` the commands of `sb3-htr` load it so, too, as it has classes of its own."
 
 
 def training_command(record: dict[str, Any]) -> str:
@@ -139,9 +141,9 @@ def snippet(algorithm: Algorithm, path: str, env: str, n_episodes: int) -> str:
     :param n_episodes: of an adaptation
     :return: Python that loads the agent and lets it adapt to a task
     """
-    name = algorithm.model_class.__name__
+    name, module = algorithm.model_class.__name__, algorithm.model_class.__module__
     if hasattr(algorithm.model_class, "adapt"):
-        return f"""from sb3_htr import {name}
+        return f"""from {"sb3_htr" if module.startswith("sb3_htr.pearl.") else module} import {name}
 
 model = {name}.load({path})
 env = {env}
@@ -149,7 +151,7 @@ agent = model.adapt(env, n_episodes={n_episodes}, task=env.get_wrapper_attr("tes
 print(agent.returns)  # of the adaptation episodes; agent.predict(observation) acts on this task
 """
     return f"""from sb3_htr import evaluate_adaptation
-from {algorithm.model_class.__module__} import {name}
+from {module} import {name}
 
 model = {name}.load({path})
 env = {env}
@@ -158,11 +160,14 @@ print(returns)  # of the episodes
 """
 
 
-def model_card(record: dict[str, Any], scores: dict[str, AdaptationRecord], repo_id: str | None = None) -> str:
+def model_card(
+    record: dict[str, Any], scores: dict[str, AdaptationRecord], repo_id: str | None = None, needs_trust: bool = False
+) -> str:
     """
     :param record: of an exported agent
     :param scores: explorer and its adaptations to the test tasks
     :param repo_id: where it will be on the Hugging Face Hub
+    :param needs_trust: whether commands load it by ``--trust`` alone
     :return: content of ``README.md``
     """
     # A model file of one's own names no method
@@ -197,7 +202,7 @@ def model_card(record: dict[str, Any], scores: dict[str, AdaptationRecord], repo
     model = model_name(env_id, algorithm.name)
     file = f"{model}.zip"
     own = " ".join(package for package in record["gym_packages"] or () if package not in PACKAGES)
-    own = own and f" --gym-packages {own}"
+    own = (own and f" --gym-packages {own}") + " --trust" * needs_trust
     watch = f"sb3-htr enjoy {file}{own}"
     path = f'"{file}"'
     if repo_id is not None:
@@ -240,7 +245,7 @@ import gymnasium
 
 {imports}{use}```
 
-A model file can run code when it is loaded like this. The commands of `sb3-htr` read the weights and plain settings alone.
+A model file can run code when it is loaded like this. {OF_TRUST if needs_trust else OF_COMMANDS}
 
 ## Training
 
