@@ -36,7 +36,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     try:
         yield temporary
         for file in temporary.rglob("*") if temporary.is_dir() else [temporary]:
-            with open(file, "rb") as handle:
+            with open(file, "r+b") as handle:  # Windows syncs no file that is open for reading only
                 os.fsync(handle.fileno())
         # A folder replaces a folder; a file does not
         if temporary.is_dir() and path.is_dir():

@@ -1,7 +1,10 @@
 """Files that are never half written, damage that is noticed, and reading that runs no code."""
 
+import fcntl
 import json
+import os
 import random
+import stat
 import struct
 import warnings
 from collections.abc import Callable
@@ -38,6 +41,22 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
         folder.mkdir()
         (folder / "other").write_text("x")
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["other"]
+
+
+def test_files_are_synced_by_handles_that_may_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows syncs no others."""
+    fsync, synced = os.fsync, []
+
+    def fsync_of_windows(handle: int) -> None:
+        if stat.S_ISREG(os.fstat(handle).st_mode):
+            assert fcntl.fcntl(handle, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDWR
+            synced.append(handle)
+        fsync(handle)
+
+    monkeypatch.setattr("os.fsync", fsync_of_windows)
+    with atomic_path(tmp_path / "file") as path:
+        path.write_text("whole")
+    assert len(synced) == 1 and (tmp_path / "file").read_text() == "whole"
 
 
 @pytest.mark.parametrize(
