@@ -5,6 +5,8 @@ import os
 import signal
 from collections.abc import Callable, Sequence
 from contextlib import closing
+from multiprocessing.process import BaseProcess
+from multiprocessing.util import Finalize
 from typing import Any, cast
 
 import gymnasium as gym
@@ -192,7 +194,7 @@ def make_task_vec_env(
     if spec.vector_entry_point is None or wrapper is not None or vec_env_class is not None or "render_mode" in env_kwargs:
 
         def make_env() -> gym.Env:
-            if vec_env_class is SubprocVecEnv:
+            if vec_env_class is not None and issubclass(vec_env_class, SubprocVecEnv):
                 # For the training, which ends a rollout, and then these
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
                 signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -201,6 +203,9 @@ def make_task_vec_env(
             return env if wrapper is None else wrapper(env)
 
         venv = (vec_env_class or DummyVecEnv)([make_env] * n_envs)
+        if isinstance(venv, SubprocVecEnv):
+            # Where nobody closes it: at exit, multiprocessing waits for these processes, after a SIGTERM, which they ignore
+            Finalize(venv, _kill, [venv.processes], exitpriority=0)
         check_has_task_family(venv.has_attr("task_family"))
     else:
         vector_env = gym.make_vec(env_id, n_envs, vectorization_mode="vector_entry_point", **env_kwargs)
@@ -215,6 +220,11 @@ def make_task_vec_env(
     if seed is not None:
         monitored.seed(seed)
     return monitored
+
+
+def _kill(processes: list[BaseProcess]) -> None:
+    for process in processes:
+        process.kill()
 
 
 def family_of(env_id: str, env_kwargs: dict[str, Any] | None = None) -> TaskFamily:

@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -169,6 +170,32 @@ def test_ctrl_c_leaves_envs_in_processes_to_the_training() -> None:
     env.step(np.zeros((1, 2), dtype=np.float32))
     env.close()
     assert all(process.exitcode == 0 for process in processes)
+
+
+class ForkedVecEnv(SubprocVecEnv):
+    def __init__(self, env_fns: list[Any]) -> None:
+        super().__init__(env_fns, start_method="fork")
+
+
+@pytest.mark.parametrize("exitcode", [0, 1])
+def test_a_process_ends_that_leaves_envs_open(exitcode: int) -> None:
+    def leave_open() -> None:
+        global env
+        env = make_task_vec_env(ENV_ID, 2, vec_env_class=ForkedVecEnv)
+        env.reset()
+        for process in env.unwrapped.processes:  # type: ignore[attr-defined]
+            os.kill(process.pid, signal.SIGTERM)  # as a scheduler sends to all
+        time.sleep(0.5)
+        env.step(np.zeros((2, 2), dtype=np.float32))
+        if exitcode:
+            env.step_async(np.zeros((2, 2), dtype=np.float32))
+            raise KeyboardInterrupt
+
+    process = get_context("fork").Process(target=leave_open)
+    process.start()
+    process.join(30)
+    process.kill()
+    assert process.exitcode == exitcode
 
 
 def test_runs_of_consecutive_seeds_share_no_env() -> None:
