@@ -5,6 +5,7 @@ import subprocess
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch as th
@@ -20,7 +21,7 @@ from sb3_htr.common.checkpoint import checkpoints, load_latest
 from sb3_htr.common.checkpoint_callback import CheckpointCallback
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.zoo.cli import main
-from sb3_htr.zoo.run.callbacks import ProgressCallback
+from sb3_htr.zoo.run.callbacks import PatientCSV, ProgressCallback
 
 SETTINGS = ["--seed", "3", "--save-freq", "1", "--env-kwargs", "goal_distance:0.4", "n_validation_tasks:1"]
 
@@ -114,6 +115,25 @@ def test_tensorboard_without_room_ends_no_training(
         model.learn(3 * ROLLOUT, ProgressCallback(tmp_path / "progress.csv"))
     assert len([warning for warning in said if "TensorBoard's" in str(warning.message)]) == 1
     assert model.num_timesteps == 3 * ROLLOUT and len([*(tmp_path / "tb").rglob("events*")]) == 2
+
+
+def test_a_log_that_had_no_room_is_whole_once_there_is_some(tmp_path: Path) -> None:
+    """Also where the row that had none was the first with a column."""
+    rows: list[dict[str, Any]] = [{"a": 1.0}, {"a": 2.0, "b": "x" * 5000}, {"a": 3.0, "b": "y"}, {"a": 4.0}]
+    with disk(tmp_path, 24) as folder:
+        log = PatientCSV(folder / "progress.csv")
+        for i, row in enumerate(rows):
+            if i == 1:
+                (folder / "filler").write_bytes(bytes(20480))
+                with pytest.warns(UserWarning, match=r"progress\.csv could not be written \(No space left.*Training goes on"):
+                    log.write(row, dict.fromkeys(row, ()))
+                assert (folder / "progress.csv").read_text() == "a\n1.0\n", "what was there is not touched"
+                (folder / "filler").unlink()
+            else:
+                log.write(row, dict.fromkeys(row, ()))
+        log.close()
+        lines = (folder / "progress.csv").read_text().splitlines()
+    assert lines == ["a,b", "1.0,", f'2.0,"{"x" * 5000}"', '3.0,"y"', "4.0,"]
 
 
 def test_a_lost_progress_file_is_written_anew(tiny_pearl: MakePEARL, tmp_path: Path) -> None:

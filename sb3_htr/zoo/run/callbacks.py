@@ -2,6 +2,8 @@
 
 import contextlib
 import os
+from collections.abc import Sequence
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -10,19 +12,60 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import CSVOutputFormat, TensorBoardOutputFormat
 
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
+from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.errors import training_goes_on
 
 
 class PatientCSV(CSVOutputFormat):
-    """Writes as long as that is possible: a disk that is full stops no training."""
+    """
+    A disk that is full stops no training: all rows are in memory, so the next write makes up for one that failed, or for a
+    file that somebody has removed.
+
+    :param path: file, which is replaced
+    :param keys: columns so far
+    :param text: what the file had so far
+    """
+
+    file: Any
+
+    def __init__(self, path: Path, keys: Sequence[str] = (), text: str = "") -> None:
+        super().__init__(os.devnull)
+        self.file.close()
+        self.path, self.keys, self.file = path, list(keys), StringIO()
+        self.file.write(text)
+        self._is_whole = False
+        self._put("")
+
+    @property
+    def text(self) -> str:
+        """All of it, in the file or not."""
+        return str(self.file.getvalue())
 
     def write(self, *args: Any, **kwargs: Any) -> None:
-        with training_goes_on(self.file.name):
-            super().write(*args, **kwargs)
+        before = self.text
+        super().write(*args, **kwargs)
+        self._put(before)
+
+    def _put(self, before: str) -> None:
+        """Into the file, which has what was before, unless that failed."""
+        can_append = self._is_whole and self.path.exists() and self.text.startswith(before)
+        self._is_whole = False
+        with training_goes_on(str(self.path)):
+            if can_append:
+                with self.path.open("ab") as file:
+                    file.write(self.text[len(before) :].encode())
+            else:  # of a stranger's run it may be a link, to a file that is not the run's
+                self.save()
+            self._is_whole = True
+
+    def save(self) -> None:
+        """Write all of it."""
+        with atomic_path(self.path) as temporary:
+            temporary.write_bytes(self.text.encode())
 
     def close(self) -> None:
-        with contextlib.suppress(OSError):  # what could not be written before
-            super().close()
+        if not self._is_whole:
+            self._put("")
 
 
 class PatientTensorBoard(TensorBoardOutputFormat):
@@ -56,20 +99,14 @@ class ProgressCallback(BaseCallback):
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         super().__init__()
-        self.path = os.fspath(path)
+        self.path = Path(path)
         self._written: dict[str, Any] = {"keys": [], "text": ""}
 
     def state_dict(self) -> dict[str, Any]:
         """
         :return: what was written so far
         """
-        # Not by its name: somebody may have removed it
-        self._output.file.seek(0)
-        self._written = {"keys": list(self._output.keys), "text": self._output.file.read()}
-        if not os.path.exists(self.path):
-            self._end()
-            self._begin()
-        return self._written
+        return {"keys": list(self._output.keys), "text": self._output.text}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """
@@ -77,30 +114,18 @@ class ProgressCallback(BaseCallback):
         """
         self._written = state
 
-    def _begin(self) -> None:
-        # A run of a stranger may have a link there, to a file that is not the run's
-        Path(self.path).unlink(missing_ok=True)
-        self._output = PatientCSV(self.path)
-        self._output.keys = list(self._written["keys"])
-        self._output.file.write(self._written["text"])
-        self._output.file.flush()
+    def _on_training_start(self) -> None:
+        self._output = PatientCSV(self.path, **self._written)
         outputs = self.logger.output_formats
         outputs[:] = [PatientTensorBoard(out) if isinstance(out, TensorBoardOutputFormat) else out for out in outputs]
         outputs.append(self._output)
-
-    def _end(self) -> None:
-        if self._output in self.logger.output_formats:
-            self.logger.output_formats.remove(self._output)
-            self._output.close()
-
-    def _on_training_start(self) -> None:
-        self._begin()
 
     def _on_step(self) -> bool:
         return True
 
     def _on_training_end(self) -> None:
-        self._end()
+        self.logger.output_formats.remove(self._output)
+        self._output.close()
 
 
 class MetaTrialEvalCallback(TrialEvalCallback, MetaEvalCallback):
