@@ -1,6 +1,8 @@
-"""Checksums of files."""
+"""Checksums of files and code."""
 
 import hashlib
+import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 
@@ -16,3 +18,18 @@ def sha256(*files: Path) -> str:
             while block := file.read(1 << 20):
                 digest.update(block)
     return digest.hexdigest()
+
+
+def digest_of_code(modules: Iterable[str]) -> str:
+    """
+    :param modules: names of modules and packages that are imported
+    :return: SHA-256 of their files; of a module within a package, of all files of the package: the module may import or read
+        any of them
+    """
+    files: list[Path] = []
+    for module in modules:
+        outermost = sys.modules[module.partition(".")[0]]
+        folders = [Path(folder) for folder in getattr(outermost, "__path__", ())]
+        inside = [file for folder in folders for file in sorted(folder.rglob("*")) if file.is_file()]
+        files += [file for file in inside if file.suffix != ".pyc"] if folders else [Path(outermost.__file__ or "")]
+    return sha256(*files)

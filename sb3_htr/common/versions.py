@@ -9,6 +9,8 @@ from typing import Any
 
 import torch as th
 
+from sb3_htr.common.digest import digest_of_code
+
 # Of the code that runs, which may be on the path and not installed
 VERSION = (Path(__file__).parents[1] / "version.txt").read_text().strip()
 PACKAGES = ("stable_baselines3", "sb3_contrib", "gymnasium", "rl_zoo3", "torch", "numpy", "mujoco")
@@ -81,9 +83,10 @@ def named(code: Mapping[str, Any]) -> str:
 
 def made_by() -> dict[str, Any]:
     """
-    :return: ``versions``, and ``commit`` and ``clean`` within a checkout, for the record of a run
+    :return: for the record of a run: ``versions``; ``code``, the digest of that of this project; and ``commit`` and ``clean``
+        within a checkout
     """
-    return {"versions": versions(), **commit()}
+    return {"versions": versions(), "code": digest_of_code(("sb3_htr", "htr_envs")), **commit()}
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
@@ -93,6 +96,9 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     :return: what is not alike, as ``"torch 2.12.0 -> 2.13.0"``
     """
     old, new = ({**code.get("versions", {}), "commit": named({**code, "resumed_by": ()})} for code in (before, now))
+    # Two working trees with changes have one name; older records have no digest
+    if old["commit"] == new["commit"] and "code" in before:
+        old["code"], new["code"] = (str(code["code"])[:10] for code in (before, now))
     return [
         f"{name} {old.get(name, 'unknown')} -> {new.get(name, 'none')}"
         for name in {**old, **new}

@@ -1,8 +1,8 @@
 """Evaluations of a final model are kept as they end: all of them together may take longer than its training."""
 
+import contextlib
 import json
-import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,24 +10,9 @@ import numpy as np
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.digest import sha256
-from sb3_htr.experiments.cell import REMOVE, KwArgs, file_name
+from sb3_htr.experiments.cell import KwArgs, file_name
 
 FOLDER = "evaluated"
-
-
-def digest_of_code(modules: Iterable[str]) -> str:
-    """
-    :param modules: names of modules and packages that are imported
-    :return: SHA-256 of their files; of a module within a package, of all files of the package: the module may import or read
-        any of them
-    """
-    files: list[Path] = []
-    for module in modules:
-        outermost = sys.modules[module.partition(".")[0]]
-        folders = [Path(folder) for folder in getattr(outermost, "__path__", ())]
-        inside = [file for folder in folders for file in sorted(folder.rglob("*")) if file.is_file()]
-        files += [file for file in inside if file.suffix != ".pyc"] if folders else [Path(outermost.__file__ or "")]
-    return sha256(*files)
 
 
 class EvaluationCache:
@@ -50,7 +35,9 @@ class EvaluationCache:
         :return: its arrays, from a file where there is one of the same model and of the same of all else
         """
         path = self.folder / f"{file_name(name)}.npz"
-        arrays: KwArgs = load_arrays(path, advice=REMOVE) if path.exists() else {}
+        arrays: KwArgs = {}
+        with contextlib.suppress(OSError, ValueError):  # not there yet, or damaged
+            arrays = load_arrays(path)
         if str(arrays.pop("of", "")) != self._of:
             arrays = make()
             self.folder.mkdir(exist_ok=True)

@@ -14,10 +14,11 @@ from htr_envs.goal_env import find_hidden
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checkpoint import checkpoints
+from sb3_htr.common.digest import digest_of_code
 from sb3_htr.common.settings import name_of
 from sb3_htr.common.versions import UNKNOWN_HARDWARE, commit, hardware, named, versions
 from sb3_htr.experiments.cell import MOVE, REMOVE, Cell, Evaluation
-from sb3_htr.experiments.evaluation_cache import FOLDER, EvaluationCache, digest_of_code
+from sb3_htr.experiments.evaluation_cache import FOLDER, EvaluationCache
 from sb3_htr.experiments.log import logged
 from sb3_htr.experiments.protocol import check_evaluations, evaluate
 from sb3_htr.zoo.commands import train

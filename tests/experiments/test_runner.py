@@ -21,10 +21,11 @@ from helpers.runs import OF_CELL
 from sb3_htr import PEARL, evaluate_adaptation, make_task_vec_env
 from sb3_htr.adaptation.explorers import Prior
 from sb3_htr.common.checkpoint import checkpoints, write_checkpoint
+from sb3_htr.common.digest import digest_of_code
 from sb3_htr.common.versions import hardware
 from sb3_htr.experiments import grid
 from sb3_htr.experiments.cell import Cell
-from sb3_htr.experiments.evaluation_cache import FOLDER, digest_of_code
+from sb3_htr.experiments.evaluation_cache import FOLDER
 from sb3_htr.experiments.executors import SerialExecutor
 from sb3_htr.experiments.grid import Experiment, Variant, by
 from sb3_htr.experiments.protocol import evaluate
@@ -156,8 +157,9 @@ def test_a_killed_evaluation_goes_on_after_what_it_has(tmp_path: Path, monkeypat
     shutil.copytree(here, elsewhere)
     monkeypatch.setattr(train, "main", refuse)
     made.clear()
-    assert run_cell(cell, here) and made == ["prior", "prior", "belief", "belief"]
     most = 99
+    next(here.rglob(f"{FOLDER}/*")).write_bytes(b"damaged")
+    assert run_cell(cell, here) and made[-4:] == ["prior", "prior", "belief", "belief"] and len(made) == 6
     made.clear()
     monkeypatch.setattr("sb3_htr.experiments.runner.digest_of_code", lambda modules: "other")
     assert run_cell(cell, elsewhere) and len(made) == 8
