@@ -139,6 +139,18 @@ def test_a_run_whose_model_could_not_be_written_is_not_finished(unbroken: Path, 
     assert PEARL.load(model).num_timesteps == 2400
 
 
+def test_a_run_whose_model_is_damaged_is_not_finished(unbroken: Path, tmp_path: Path) -> None:
+    """It can be made from the last checkpoint."""
+    run = run_folder(tmp_path)
+    shutil.copytree(unbroken, run)
+    model = run / f"{ENV_ID}.zip"
+    content = bytearray(model.read_bytes())
+    content[len(content) // 2] ^= 1
+    model.write_bytes(content)
+    assert main(["train", "--resume", str(run)]) == 0
+    assert_same_run(run, unbroken)
+
+
 def test_training_further_is_as_if_it_had_been_planned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for folder, planned in (("at_once", "960"), ("further", "480")):
         arguments = [word if word != str(STEPS) else planned for word in TRAIN]
@@ -400,6 +412,25 @@ def test_a_run_that_goes_on_with_other_code_says_so(unbroken: Path, tmp_path: Pa
     after = json.loads((again / "run.json").read_text())
     assert after == {**before, "hardware": ["a GPU", *record["hardware"]], "resumed_by": [resumed]}
     assert named(after) == f"{named(before)}, then {named(record)}"
+
+
+def test_a_run_that_goes_on_with_other_changes_says_so(
+    unbroken: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On one commit, where it says as little as that there are some."""
+    run = cut_off(unbroken, tmp_path)
+    record = json.loads((run / "run.json").read_text())
+    digest = record["code"]
+    (run / "run.json").write_text(json.dumps({**record, "code": "0123456789abcdef"}))
+    with pytest.warns(UserWarning, match=rf"goes on with other code \(code 0123456789 -> {digest[:10]}\)"):
+        assert main(["train", "--resume", str(run)]) == 0
+    (resumed,) = json.loads((run / "run.json").read_text())["resumed_by"]
+    assert resumed["code"] == digest
+    older = cut_off(unbroken, tmp_path / "older")
+    without = {key: value for key, value in record.items() if key != "code"}
+    (older / "run.json").write_text(json.dumps(without))
+    assert main(["train", "--resume", str(older)]) == 0
+    assert json.loads((older / "run.json").read_text()) == without
 
 
 class InterruptsOnce(BaseCallback):

@@ -6,6 +6,7 @@ import json
 import os
 import sys
 import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
@@ -155,12 +156,13 @@ def n_steps_of(run: Path, env_id: str) -> int:
     """
     :param run: run folder
     :param env_id: env that it was trained on
-    :return: env steps that its last model was trained for, 0 if there is none, or it does not say
+    :return: env steps that its last model was trained for, 0 if there is none, or it is damaged or does not say
     """
     try:
         with zipfile.ZipFile(run / f"{file_stem(env_id)}.zip") as archive:
-            return int(json.loads(archive.read("data"))["num_timesteps"])
-    except (OSError, zipfile.BadZipFile, KeyError, TypeError, ValueError):
+            n_steps = int(json.loads(archive.read("data"))["num_timesteps"])
+            return 0 if archive.testzip() else n_steps
+    except (OSError, zipfile.BadZipFile, zlib.error, NotImplementedError, KeyError, TypeError, ValueError):
         return 0
 
 
