@@ -112,6 +112,23 @@ def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SearchManager, "objective", lambda *_: 1.0)
 
 
+def test_a_search_that_is_interrupted_says_so_when_it_has_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nothing should train with the best of half a search."""
+
+    def interrupted_at_second(_: object, trial: optuna.Trial) -> float:
+        if trial.number == 1:
+            raise KeyboardInterrupt
+        return 1.0
+
+    monkeypatch.setattr(MetaExperimentManager, "objective", interrupted_at_second)
+    write_settings(tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        join(tmp_path, "--n-trials", "3")
+    assert "Best trial:" in capsys.readouterr().out and list(tmp_path.rglob("report_*.csv"))
+
+
 def join(folder: Path, *more: str) -> int:
     """One worker of a study, with settings of a file."""
     arguments = ["optimize", "--env", ENV_ID, "-f", str(folder), "--n-trials", "1", "--verbose", "0"]
@@ -300,6 +317,21 @@ def test_bad_storages_are_named_in_one_sentence(quick: None, tmp_path: Path) -> 
         search(tmp_path, "study.db")
     with pytest.raises(ValueError, match=r"The storage sqlite:////nowhere/study.db cannot be used: unable to open"):
         search(tmp_path, "sqlite:////nowhere/study.db")
+
+
+def test_a_torn_journal_is_named_and_left_alone(at_once: None, tmp_path: Path) -> None:
+    """As a worker leaves it that is killed while it writes, or whose disk is full."""
+    write_settings(tmp_path)
+    assert join(tmp_path) == 0
+    journal = tmp_path / "study.log"
+    whole = journal.read_bytes()
+    for torn in (whole[:-5], whole[:-5] + whole[-20:], whole[:-5] + whole):
+        journal.write_bytes(torn)
+        with pytest.raises(ValueError, match=rf"The storage {journal} cannot be used, as its last line, .* remove that line"):
+            join(tmp_path)
+        assert journal.read_bytes() == torn
+    journal.write_bytes(whole[: whole[:-1].rindex(b"\n") + 1])
+    assert join(tmp_path) == 0
 
 
 def test_a_search_that_learnt_nothing_says_so(

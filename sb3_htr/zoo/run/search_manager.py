@@ -34,6 +34,8 @@ def pickle_study(study: optuna.Study, file: IO[bytes]) -> None:
 class SearchManager(MetaExperimentManager):
     """One worker of a study."""
 
+    _interrupted = False
+
     def _check_use(self) -> None:
         if self.method.algorithm.search_space is None:
             raise ValueError(
@@ -82,9 +84,16 @@ class SearchManager(MetaExperimentManager):
         except DivergedError as error:
             print(f"Trial {trial.number} is pruned: {error}")
             raise optuna.TrialPruned from error
+        except KeyboardInterrupt:
+            self._interrupted = True
+            raise
 
     def hyperparameters_optimization(self) -> None:
-        """Search. Where the report goes is looked at first."""
+        """
+        Search. Where the report goes is looked at first.
+
+        :raises KeyboardInterrupt: after the report, if a trial was interrupted: a script should not go on
+        """
         Path(self.log_folder, self.algo).mkdir(parents=True, exist_ok=True)
         if self.storage is not None:  # not before: what is refused by itself leaves the study to others
             facts = {"env": self.env_name.gym_id, "method": self.method.name, "settings": self._of_study}
@@ -96,6 +105,8 @@ class SearchManager(MetaExperimentManager):
             if all(frame.name != "best_trial" for frame in traceback.extract_tb(error.__traceback__)):
                 raise
             print("none: no trial was finished. The same command goes on.")
+        if self._interrupted:  # rl_zoo3 ends as usual
+            raise KeyboardInterrupt
 
     def _sampled(self, trial: optuna.Trial) -> dict[str, Any]:
         space = self.method.algorithm.search_space

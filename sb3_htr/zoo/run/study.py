@@ -1,5 +1,7 @@
 """Where a study of ``sb3-htr optimize`` is kept: the file of a journal (``.log``), or the URL of a database."""
 
+import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +9,9 @@ import optuna
 import sqlalchemy
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
+
+# Seconds that one worker has to write a line of a journal
+PAUSE = 0.5
 
 
 def url_of(storage: str) -> sqlalchemy.URL | None:
@@ -30,12 +35,31 @@ def opened(storage: str) -> JournalStorage | str:
     """
     :param storage: as given
     :return: for Optuna
-    :raises ValueError: if it is neither journal nor database
+    :raises ValueError: if it is neither journal nor database, or a journal with a line that is not whole
     """
     if url_of(storage) is not None:
         return storage
-    Path(storage).parent.mkdir(parents=True, exist_ok=True)
-    return JournalStorage(JournalFileBackend(storage))
+    journal = Path(storage)
+    journal.parent.mkdir(parents=True, exist_ok=True)
+    if _is_torn(journal):
+        time.sleep(PAUSE)
+    try:
+        if _is_torn(journal):  # Optuna would write onto the same line
+            raise ValueError
+        return JournalStorage(JournalFileBackend(storage))
+    except ValueError:
+        raise ValueError(
+            f"The storage {storage} cannot be used, as its last line, or one before, is damaged: remove that line."
+        ) from None
+
+
+def _is_torn(journal: Path) -> bool:
+    """Whether its last line is not whole, or not yet."""
+    lines = journal.read_bytes().splitlines(keepends=True) if journal.exists() else []
+    try:
+        return not all(line.endswith(b"\n") and json.loads(line) for line in lines[-1:])
+    except ValueError:
+        return True
 
 
 def _file(storage: str) -> str | None:
