@@ -346,7 +346,10 @@ def check_device(device: th.device | str) -> None:
     try:
         used = get_device(device)
         th.empty(0, device=used)
+        usable = used.type in ("cpu", "cuda")  # others, as mps, lack float64
     except (RuntimeError, AssertionError, NotImplementedError, TypeError):
-        raise ValueError(f"The device {str(device)!r} cannot be used: give cpu, cuda or cuda:N.") from None
+        usable = False
+    if not usable:
+        raise ValueError(f"The device {str(device)!r} cannot be used: give cpu, cuda or cuda:N.")
     if device != "auto" and th.device(device).type != used.type:
         warnings.warn(f"There is no {device} that torch could use: {used} is used.", stacklevel=3)

@@ -78,6 +78,8 @@ from sb3_htr.common.vec_env import make_task_vec_env
         *(({"policy": policy}, "policy is .*, expected a class derived from sb3_htr") for policy in (None, 3)),
         ({"verbose": "a"}, "verbose is 'a', expected a whole number"),
         ({"stats_window_size": 0}, "stats_window_size is 0, expected a whole number of at least 1"),
+        ({"device": th.device("mps")}, "The device 'mps' cannot be used: give cpu"),
+        ({"device": "meta"}, "The device 'meta' cannot be used: give cpu"),
         ({"device": None}, "The device 'None' cannot be used: give cpu"),
         ({"ent_coef": -0.1}, "ent_coef is -0.1, expected a number of at least 0"),
         *(
