@@ -46,6 +46,7 @@ class Processes(ThreadPoolExecutor):
     def __init__(self, n: int) -> None:
         super().__init__(n)
         # They get the environment of this one; torch and BLAS would take all cores each
+        self._omp_num_threads = os.environ.get("OMP_NUM_THREADS")
         os.environ["OMP_NUM_THREADS"] = "1"
         self._running: set[int] = set()
         self._ends, self._lock = False, Lock()
@@ -72,17 +73,24 @@ class Processes(ThreadPoolExecutor):
         :param cancel_futures: end what runs, too: it has the same interrupt as this process, and stops with a checkpoint
         """
         super().shutdown(wait=False, cancel_futures=cancel_futures)
-        while cancel_futures:
-            with self._lock:
-                self._ends = True
-                for pid in self._running:
-                    with suppress(ProcessLookupError):
-                        os.kill(pid, signal.SIGINT)
-            try:
-                return super().shutdown(wait)
-            except KeyboardInterrupt:  # a second one: at once
-                continue
-        super().shutdown(wait)
+        try:
+            while cancel_futures:
+                with self._lock:
+                    self._ends = True
+                    # On Windows, the terminal's Ctrl-C has reached them, and os.kill would end them without a checkpoint
+                    for pid in self._running if os.name == "posix" else ():
+                        with suppress(OSError):
+                            os.kill(pid, signal.SIGINT)
+                try:
+                    return super().shutdown(wait)
+                except KeyboardInterrupt:  # a second one: at once
+                    continue
+            super().shutdown(wait)
+        finally:
+            if self._omp_num_threads is None:
+                os.environ.pop("OMP_NUM_THREADS", None)
+            else:
+                os.environ["OMP_NUM_THREADS"] = self._omp_num_threads
 
 
 def _begin_in_a_process() -> None:

@@ -205,6 +205,18 @@ def test_the_claim_of_a_killed_process_is_void(tmp_path: Path) -> None:
     assert not SharedFolder(tmp_path).is_claimed(cell)
 
 
+@pytest.mark.parametrize("n_threads", [None, "3"])
+def test_processes_have_one_thread_and_the_host_those_that_it_had(
+    n_threads: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    if n_threads is not None:
+        monkeypatch.setenv("OMP_NUM_THREADS", n_threads)
+    with Processes(1):
+        assert os.environ["OMP_NUM_THREADS"] == "1"
+    assert os.environ.get("OMP_NUM_THREADS") == n_threads
+
+
 def test_a_killed_worker_process_takes_no_other_with_it() -> None:
     with Processes(2) as executor:
         killed, other = executor.submit(os._exit, 9), executor.submit(os.getpid)
