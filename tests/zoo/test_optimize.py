@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -197,6 +198,17 @@ def test_a_mistyped_env_leaves_the_name_of_the_study_free(quick: None, tmp_path:
 
 def test_a_study_in_a_journal(quick: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     check_search(tmp_path, f"{tmp_path}/journal/study.log", capsys, method="htr-ec")
+
+
+def test_a_journal_needs_no_symbolic_links_on_windows(
+    quick: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def symlink(*_: Any) -> None:
+        raise OSError("A required privilege is not held by the client")
+
+    monkeypatch.setattr("os.symlink", symlink)
+    monkeypatch.setattr("sb3_htr.zoo.run.study.os", SimpleNamespace(name="nt"), raising=False)
+    check_search(tmp_path, f"{tmp_path}/journal/study.log", capsys)
 
 
 def as_postgres(command: list[str]) -> list[str]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import optuna
 import rl_zoo3.train
 from rl_zoo3 import exp_manager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER
@@ -19,6 +20,7 @@ from sb3_htr.zoo.run.algorithm import Algorithm
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback
 from sb3_htr.zoo.run.manager import MetaExperimentManager
 from sb3_htr.zoo.run.search_manager import SearchManager, pickle_study
+from sb3_htr.zoo.run.study import journal
 from sb3_htr.zoo.run.training_manager import TrainingManager
 
 
@@ -58,6 +60,7 @@ def run_rl_zoo(
             # It pickles studies alone
             "pkl": SimpleNamespace(dump=pickle_study),
         },
+        optuna.storages.journal: {"JournalFileBackend": journal},
         rl_zoo3.train: {
             "ExperimentManager": make_manager,
             "ALGOS": {algorithm.name: algorithm.model_class},

@@ -1,6 +1,7 @@
 """Where a study of ``sb3-htr optimize`` is kept: the file of a journal (``.log``), or the URL of a database."""
 
 import json
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import optuna
 import sqlalchemy
 from optuna.storages import JournalStorage
-from optuna.storages.journal import JournalFileBackend
+from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 
 # Seconds that one worker has to write a line of a journal
 PAUSE = 0.5
@@ -31,6 +32,14 @@ def url_of(storage: str) -> sqlalchemy.URL | None:
         ) from None
 
 
+def journal(file: str) -> JournalFileBackend:
+    """
+    :param file: of a journal
+    :return: for Optuna, whose own choice of a lock is a symbolic link, which users of Windows may not make
+    """
+    return JournalFileBackend(file, JournalFileOpenLock(file) if os.name == "nt" else None)
+
+
 def opened(storage: str) -> JournalStorage | str:
     """
     :param storage: as given
@@ -39,23 +48,23 @@ def opened(storage: str) -> JournalStorage | str:
     """
     if url_of(storage) is not None:
         return storage
-    journal = Path(storage)
-    journal.parent.mkdir(parents=True, exist_ok=True)
-    if _is_torn(journal):
+    file = Path(storage)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    if _is_torn(file):
         time.sleep(PAUSE)
     try:
-        if _is_torn(journal):  # Optuna would write onto the same line
+        if _is_torn(file):  # Optuna would write onto the same line
             raise ValueError
-        return JournalStorage(JournalFileBackend(storage))
+        return JournalStorage(journal(storage))
     except ValueError:
         raise ValueError(
             f"The storage {storage} cannot be used, as its last line, or one before, is damaged: remove that line."
         ) from None
 
 
-def _is_torn(journal: Path) -> bool:
+def _is_torn(file: Path) -> bool:
     """Whether its last line is not whole, or not yet."""
-    lines = journal.read_bytes().splitlines(keepends=True) if journal.exists() else []
+    lines = file.read_bytes().splitlines(keepends=True) if file.exists() else []
     try:
         return not all(line.endswith(b"\n") and json.loads(line) for line in lines[-1:])
     except ValueError:
