@@ -150,7 +150,7 @@ def state(results: Path) -> str:
     :return: Markdown: what is of today's code, and what is but for changes of rounding; then a table with a line for all runs
         of an experiment that are older than the same changes, those of rounding in a sentence beneath it
     """
-    known = yaml.safe_load((results / "changes.yml").read_text())
+    known = yaml.safe_load((results / "changes.yml").read_text(encoding="utf-8"))
     rounding = [change["name"] for change in known["changes"] if change.get("rounding")]
     n_runs: Counter[tuple[str, str]] = Counter()
     today: list[Run] = []

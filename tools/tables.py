@@ -198,9 +198,9 @@ def fill(documents: Iterable[Path], tables: dict[str, str]) -> None:
     :param tables: see :func:`filled`
     """
     for document in documents:
-        text = filled(document.read_text(), tables, document)
+        text = filled(document.read_text(encoding="utf-8"), tables, document)
         with atomic_path(document) as temporary:
-            temporary.write_text(text)
+            temporary.write_text(text, encoding="utf-8")
 
 
 def tables() -> dict[str, str]:

@@ -1,5 +1,6 @@
 """Agents that are shared: exported, uploaded, downloaded, and used as their model card says."""
 
+import locale
 import re
 import shutil
 from pathlib import Path
@@ -32,6 +33,17 @@ def names(folder: Path | str) -> list[str]:
 @pytest.mark.parametrize("env_id", [ENV_ID, "HiddenGoal/FetchReach-v4", "my_package:Mine-v3"])
 def test_names_are_those_of_huggingface_sb3(env_id: str) -> None:
     assert files(model_name(env_id))[0] == ModelName("pearl", EnvironmentName(env_id)).filename
+
+
+def test_a_model_card_has_its_letters_whatever_the_locale(tmp_path: Path, tiny_pearl: MakePEARL) -> None:
+    run = make_run(tmp_path / "runs", tiny_pearl())
+    before = locale.setlocale(locale.LC_CTYPE, None)
+    locale.setlocale(locale.LC_CTYPE, "C")
+    try:
+        assert main(["export", str(run), "--n-episodes", "1", "-o", str(tmp_path / "agent")]) == 0
+    finally:
+        locale.setlocale(locale.LC_CTYPE, before)
+    assert "±" in (tmp_path / "agent" / "README.md").read_text(encoding="utf-8")
 
 
 def test_an_agent_goes_to_the_hub_and_comes_back(

@@ -133,7 +133,8 @@ def main(argv: Sequence[str]) -> None:
     if repo_id is not None and "/" not in repo_id:
         repo_id += f"/{name}"
     with atomic_path(output / CARD) as temporary:
-        temporary.write_text(model_card(record, scores, repo_id, args.trust and _needs_trust(exported, args.device)))
+        card = model_card(record, scores, repo_id, args.trust and _needs_trust(exported, args.device))
+        temporary.write_text(card, encoding="utf-8")
     # Not before there is a new card: what an earlier export has left tells of another model
     for path in left:
         if path not in (file, output / CARD):

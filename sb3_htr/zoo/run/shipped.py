@@ -32,7 +32,7 @@ def block_of(file: str, env_id: str) -> dict[str, Any]:
     :param env_id: registered env
     :return: hyperparameters that it has for the env, of its own block or the default one, but for the method
     """
-    blocks = yaml.safe_load(hyperparams_file(file).read_text())
+    blocks = yaml.safe_load(hyperparams_file(file).read_text(encoding="utf-8"))
     block = blocks.get(env_id, blocks.get("default", {}))
     return {key: value for key, value in block.items() if key != "method"}
 
