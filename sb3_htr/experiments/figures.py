@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
+import matplotlib.figure
 import numpy as np
 
 from htr_envs.point_robot import STEP_SIZE, PointRobotFamily
@@ -91,7 +91,8 @@ def learning(results: Results, path: Path) -> None:
     :param results: raw results of the cells
     :param path: picture to write
     """
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
+    figure = matplotlib.figure.Figure(figsize=(10, 4.4), layout="constrained")
+    left, right = figure.subplots(1, 2)
     groups = by_variant(results)
     lines = {variant: explorer_lines(runs[0][0]) for variant, runs in groups.items()}
     explorers = {explorer for shown in lines.values() for explorer in shown}
@@ -124,7 +125,8 @@ def race(results: Results, path: Path) -> None:
     :param results: raw results of the cells
     :param path: picture to write
     """
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained", sharey=True)
+    figure = matplotlib.figure.Figure(figsize=(10, 4.4), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
     groups = by_variant(results)
     for colour, (variant, runs) in zip(curve_colours([*groups]), groups.items(), strict=True):
         timesteps, solved = curves([raw for _, raw in runs], "solved")
@@ -166,7 +168,8 @@ def goal_distance(results: Results, path: Path) -> None:
     :param results: raw results of the cells
     :param path: picture to write
     """
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
+    figure = matplotlib.figure.Figure(figsize=(10, 4.4), layout="constrained")
+    left, right = figure.subplots(1, 2)
     groups = by_variant(results, and_env=False)
     for colour, (variant, runs) in zip(curve_colours([*groups]), groups.items(), strict=True):
         x = sorted({cell.env_kwargs["goal_distance"] for cell, _ in runs})
@@ -200,7 +203,8 @@ def relabelling(results: Results, path: Path) -> None:
     :param path: picture to write
     """
     groups = {variant: [raw for _, raw in runs] for variant, runs in by_variant(results).items()}
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
+    figure = matplotlib.figure.Figure(figsize=(10, 4.4), layout="constrained")
+    left, right = figure.subplots(1, 2)
     probabilities = sorted(float(variant.removeprefix("K = ")) for variant in groups if variant.startswith("K = "))
     returns = [scores(groups[f"K = {k:g}"], "last_episode_return", "belief") for k in probabilities]
     # A band needs as many runs of each
@@ -235,8 +239,8 @@ def evaluations(results: Results, path: Path) -> None:
     cell, raws = runs[0][0], [raw for _, raw in runs]
     explorers = list(dict.fromkeys(evaluation.explorer for evaluation in cell.evaluations))
     places = [evaluation.tested_on for evaluation in cell.evaluations if evaluation.explorer == explorers[0]]
-    size = (3 + 2 * len(places), 3.6)
-    figure, grid = plt.subplots(1, len(places), figsize=size, layout="constrained", sharey=True, squeeze=False)
+    figure = matplotlib.figure.Figure(figsize=(3 + 2 * len(places), 3.6), layout="constrained")
+    grid = figure.subplots(1, len(places), sharey=True, squeeze=False)
     for axes, tested_on in zip(grid.flat, places, strict=True):
         for evaluation in [evaluation for evaluation in cell.evaluations if evaluation.tested_on == tested_on]:
             row = explorers.index(evaluation.explorer)
@@ -264,7 +268,8 @@ def reliability(results: Results, path: Path) -> None:
     groups = {variant: np.sum([raw["calibration"] for _, raw in runs], axis=0) for variant, runs in variants}
     if not any(bins.any() for bins in groups.values()):
         return
-    figure, axes = plt.subplots(figsize=(4.8, 4.4), layout="constrained")
+    figure = matplotlib.figure.Figure(figsize=(4.8, 4.4), layout="constrained")
+    axes = figure.subplots()
     axes.plot([0, 1], [0, 1], color=GREY, linewidth=1)
     for colour, (variant, bins) in zip(curve_colours([*groups]), groups.items(), strict=True):
         if not bins.any():

@@ -1,6 +1,8 @@
 """What pictures show, and agents whose env cannot be drawn."""
 
 import argparse
+import subprocess
+import sys
 import warnings
 from pathlib import Path
 from types import ModuleType
@@ -107,6 +109,11 @@ def test_a_learning_curve_is_of_the_env_steps_at_which_all_runs_were_evaluated(t
     assert curve.returns.tolist() == [[2000, 3000]] * 2 and curve.successes.tolist() == [[0, 1]] * 2
 
 
+def test_a_host_keeps_the_backend_that_it_chose() -> None:
+    code = "import matplotlib; matplotlib.use('svg'); import sb3_htr.zoo.plots.curves; print(matplotlib.get_backend())"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "svg\n"
+
+
 def test_curves_say_what_they_show(drawn: list[Figure], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 200)
     for n_seeds, n_points, said in (
@@ -161,7 +168,7 @@ def test_where_lines_tell_something_else_no_two_methods_have_one_colour() -> Non
 
 @pytest.mark.parametrize(("kind", "begin"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")])
 def test_the_name_of_a_picture_says_which_kind_it_is(kind: str, begin: bytes, tmp_path: Path) -> None:
-    style.save(plt.figure(), tmp_path / f"picture.{kind}")
+    style.save(Figure(), tmp_path / f"picture.{kind}")
     assert (tmp_path / f"picture.{kind}").read_bytes().startswith(begin)
 
 

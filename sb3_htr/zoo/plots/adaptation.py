@@ -3,8 +3,9 @@
 from pathlib import Path
 
 import gymnasium as gym
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
 from htr_envs import Trajectory
@@ -37,7 +38,8 @@ def plot_adaptation_curve(record: AdaptationRecord, path: Path, title: str) -> N
     """
     returns, successes = record.returns, record.successes
     episodes = np.arange(1, returns.shape[1] + 1)
-    figure, (top, bottom) = plt.subplots(2, 1, sharex=True, figsize=(6.4, 5.2), height_ratios=[2, 1])
+    figure = Figure(figsize=(6.4, 5.2))
+    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=[2, 1])
     low, high = np.quantile(returns, [0.25, 0.75], axis=0)
     top.fill_between(episodes, low, high, color=BLUE, alpha=0.2, linewidth=0, label="middle half of the tasks")
     top.plot(episodes, returns.mean(axis=0), color=BLUE, marker="o", markersize=4, label="mean over tasks")
@@ -81,9 +83,8 @@ def plot_adaptation_paths(
     order = np.argsort(np.arctan2(tasks[:, 1], tasks[:, 0]))[shown]
     columns = min(3, len(order))
     rows = -(-len(order) // columns)
-    figure, grid = plt.subplots(
-        rows, columns, figsize=(3.1 * columns, 2.3 * rows + 0.8), squeeze=False, sharex=True, sharey=True, layout="constrained"
-    )
+    figure = Figure(figsize=(3.1 * columns, 2.3 * rows + 0.8), layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     for axes in grid.flat[len(order) :]:
         axes.set_visible(False)
     for axes, task in zip(grid.flat, order, strict=False):
@@ -103,10 +104,10 @@ def plot_adaptation_paths(
         axes.set_aspect("equal")
         axes.spines[["top", "right"]].set_visible(False)
     handles = [
-        plt.Line2D([], [], color=GREY, label="before the first success"),
-        plt.Line2D([], [], color=BLUE, label="after it"),
-        plt.Line2D([], [], color=ORANGE, linewidth=2, label="last episode"),
-        plt.Line2D([], [], color=GREEN, marker="o", linestyle="", alpha=0.5, markersize=9, label="hidden goal"),
+        Line2D([], [], color=GREY, label="before the first success"),
+        Line2D([], [], color=BLUE, label="after it"),
+        Line2D([], [], color=ORANGE, linewidth=2, label="last episode"),
+        Line2D([], [], color=GREEN, marker="o", linestyle="", alpha=0.5, markersize=9, label="hidden goal"),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
     figure.suptitle(title if len(order) == len(tasks) else f"{title}; {len(order)} of them", fontsize=11)

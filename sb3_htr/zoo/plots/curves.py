@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sb3_htr.zoo.plots.intervals import iqm_interval
@@ -16,7 +16,7 @@ N_MARKERS = 12
 MARKERS = dict(zip(COLOURS, "oXD^vxsph*", strict=True))
 
 
-def band(axes: plt.Axes, x: np.ndarray, scores: np.ndarray, colour: str, style: str, label: str, alpha: float = 0.2) -> None:
+def band(axes: Axes, x: np.ndarray, scores: np.ndarray, colour: str, style: str, label: str, alpha: float = 0.2) -> None:
     """
     Draw the IQM over runs at each x, with its interval.
 
@@ -78,7 +78,8 @@ def plot_curves(curves: dict[str, Curve], path: Path, title: str, x_label: str, 
     :param x_label: of both axes
     :param y_label: of returns
     """
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4.2), layout="constrained")
+    figure = Figure(figsize=(9, 4.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
     styles = curve_styles([curve.method for curve in curves.values()])
     for (colour, style), (label, curve) in zip(styles, curves.items(), strict=True):
         label = f"{label} ({len(curve.returns)} seed{'s' * (len(curve.returns) > 1)})"

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 
 from sb3_htr.zoo.plots.style import GREY, save
 
@@ -47,7 +47,8 @@ def plot_latent_space(
     centre, directions, shares = principal_axes(mean)
     points = (mean - centre) @ directions.T
     colours, meaning = task_colours(tasks)
-    figure, axes = plt.subplots(figsize=(6.4, 5), layout="constrained")
+    figure = Figure(figsize=(6.4, 5), layout="constrained")
+    axes = figure.subplots()
     if len(known_z):
         known = (known_z - centre) @ directions.T
         axes.plot(known[:, 0], known[:, 1], "x", color=GREY, markersize=5, label="training tasks, z that solves them best")

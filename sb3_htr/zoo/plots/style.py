@@ -3,11 +3,8 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.zoo.run.method import PRIOR, methods
@@ -50,17 +47,16 @@ def curve_colours(names: Sequence[str]) -> list[str]:
     return colours
 
 
-def save(figure: plt.Figure, path: Path) -> None:
+def save(figure: Figure, path: Path) -> None:
     """
-    :param figure: to save and close
+    :param figure: to save
     :param path: picture to write; its suffix says which kind, ``.png``, ``.svg`` or ``.pdf``
     """
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=120, bbox_inches="tight")
-    plt.close(figure)
 
 
-def span_unit_if_flat(axes: plt.Axes) -> None:
+def span_unit_if_flat(axes: Axes) -> None:
     """
     :param axes: whose values may be all the same, as of an agent that has found nothing; a tiny range would show noise
     """
