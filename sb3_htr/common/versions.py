@@ -58,7 +58,9 @@ def commit(*paths: str) -> dict[str, str | bool]:
 
     def git(*arguments: str) -> str:
         command = ["git", *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True, cwd=Path(__file__).parent).stdout.strip()
+        # A path need not be text
+        done = subprocess.run(command, capture_output=True, errors="replace", check=True, cwd=Path(__file__).parent)
+        return done.stdout.strip()
 
     try:
         # An installed package may lie within a checkout of something else
