@@ -231,6 +231,17 @@ def test_a_store_has_at_any_time_what_a_killed_run_leaves(rollouts: list[tuple[i
             assert not latest or len((fetched / "progress.csv").read_text().split()) >= latest
 
 
+def test_a_disk_without_links_sends_checkpoints_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def link(*_: Any) -> None:
+        raise PermissionError("Operation not permitted")
+
+    monkeypatch.setattr("os.link", link)
+    file = "checkpoints/1_steps/manifest.json"
+    write(tmp_path / "here" / file, "1")
+    WorkingCopy(Bucket(), str(tmp_path / "there"), tmp_path / "here", lambda: True).send()
+    assert (tmp_path / "there" / file).read_text() == "1"
+
+
 def write(path: Path, text: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)

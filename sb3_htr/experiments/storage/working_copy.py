@@ -1,6 +1,7 @@
 """A folder of a store on the disk of the node that works on it."""
 
 import os
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -79,7 +80,7 @@ class WorkingCopy:
                     files = sorted(checkpoint.iterdir(), key=lambda file: file.name == MANIFEST)
                     links = {file: Path(folder, str(len(held) + i)) for i, file in enumerate(files)}
                     for file, link in links.items():
-                        os.link(file, link)
+                        _hold(file, link)
                     held |= {file.relative_to(self.here).as_posix(): link for file, link in links.items()}
             yield held
 
@@ -95,6 +96,13 @@ class WorkingCopy:
                 if self.files.exists(f"{self.there}/{name}"):
                     self.files.rm_file(f"{self.there}/{name}")
                 del self._sent[name]
+
+
+def _hold(file: Path, link: Path) -> None:
+    try:
+        os.link(file, link)
+    except OSError:  # some file systems have no links
+        shutil.copy2(file, link)
 
 
 def _is_of_checkpoint(name: str) -> bool:
