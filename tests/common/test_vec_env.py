@@ -172,6 +172,9 @@ def test_ctrl_c_leaves_envs_in_processes_to_the_training() -> None:
     assert all(process.exitcode == 0 for process in processes)
 
 
+LEFT_OPEN: list[Any] = []
+
+
 class ForkedVecEnv(SubprocVecEnv):
     def __init__(self, env_fns: list[Any]) -> None:
         super().__init__(env_fns, start_method="fork")
@@ -180,8 +183,8 @@ class ForkedVecEnv(SubprocVecEnv):
 @pytest.mark.parametrize("exitcode", [0, 1])
 def test_a_process_ends_that_leaves_envs_open(exitcode: int) -> None:
     def leave_open() -> None:
-        global env
         env = make_task_vec_env(ENV_ID, 2, vec_env_class=ForkedVecEnv)
+        LEFT_OPEN.append(env)
         env.reset()
         for process in env.unwrapped.processes:  # type: ignore[attr-defined]
             os.kill(process.pid, signal.SIGTERM)  # as a scheduler sends to all
