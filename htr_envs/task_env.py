@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from htr_envs.meta_env import FloatArray, HasTaskFamily, MetaEnv, TaskDistribution
+from htr_envs.meta_env import FloatArray as FloatArray
+from htr_envs.meta_env import HasTaskFamily, MetaEnv, TaskDistribution
 
 BoolArray = NDArray[np.bool_]
 

@@ -4,13 +4,15 @@ import os
 import time
 from typing import Any, cast
 
+import gymnasium as gym
 import numpy as np
 import torch as th
+from numpy.typing import ArrayLike
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_htr.adaptation.evaluation import MetaLearner, check_adapts, first_success, record_adaptation, task_set
-from sb3_htr.adaptation.explorers import to_explorer
+from sb3_htr.adaptation.explorers import Explorer, to_explorer
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checks import check_is_env, get_task_family
 from sb3_htr.common.errors import training_goes_on
@@ -39,11 +41,11 @@ class MetaEvalCallback(EvalCallback):
 
     def __init__(
         self,
-        eval_env: Any,
+        eval_env: VecEnv | gym.Env | str,
         *,
-        tasks: str | np.ndarray = "validation",
+        tasks: str | ArrayLike = "validation",
         n_eval_episodes: int = 20,
-        explorer: Any = None,
+        explorer: Explorer | dict[str, Any] | str | None = None,
         **kwargs: Any,
     ) -> None:
         check_numbers(n_eval_episodes=(n_eval_episodes, 1))

@@ -8,10 +8,12 @@ from typing import Any, NamedTuple, Protocol
 import gymnasium as gym
 import numpy as np
 import torch as th
+from numpy.typing import ArrayLike
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_htr.adaptation.explorers import Explorer
 from sb3_htr.adaptation.loop import Adapting, adaptation_steps
 from sb3_htr.common.checks import check_is_env, get_task_family
 from sb3_htr.common.random_state import MAX_SEED, kept_env_states, seeded_actions
@@ -136,7 +138,7 @@ def _by_episode(steps: np.ndarray, episode: np.ndarray, n_episodes: int) -> np.n
     return result
 
 
-def task_set(family: TaskFamily, tasks: str | np.ndarray) -> np.ndarray:
+def task_set(family: TaskFamily, tasks: str | ArrayLike) -> np.ndarray:
     """
     :param family: of an env
     :param tasks: ``"train"``, ``"validation"``, ``"test"``, or task vectors
@@ -161,9 +163,9 @@ def task_set(family: TaskFamily, tasks: str | np.ndarray) -> np.ndarray:
 def record_adaptation(
     model: MetaLearner,
     env: VecEnv | gym.Env | str,
-    tasks: str | np.ndarray | None = None,
+    tasks: str | ArrayLike | None = None,
     n_episodes: int = 20,
-    explorer: Any = None,
+    explorer: Explorer | dict[str, Any] | str | None = None,
     deterministic: bool = True,
     seed: int = 0,
     on_end: Callable[[Adapting, np.ndarray], None] | None = None,
@@ -221,9 +223,9 @@ def record_adaptation(
 def evaluate_adaptation(
     model: MetaLearner,
     env: VecEnv | gym.Env | str,
-    tasks: str | np.ndarray | None = None,
+    tasks: str | ArrayLike | None = None,
     n_episodes: int = 20,
-    explorer: Any = None,
+    explorer: Explorer | dict[str, Any] | str | None = None,
     deterministic: bool = True,
     seed: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -27,7 +27,7 @@ def stream(seed: int | None, name: str) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(seed).spawn(len(STREAMS))[STREAMS.index(name)])
 
 
-def checked_seed(seed: int | None) -> int | None:
+def checked_seed(seed: int | np.integer[Any] | None) -> int | None:
     """
     :param seed: of a model
     :return: the same, as Python's own generator takes it

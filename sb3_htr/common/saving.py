@@ -11,6 +11,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.settings import check_keywords, check_mappings, keywords_of
@@ -64,15 +65,26 @@ class CheckedFiles(BaseAlgorithm):
         check_keywords(cls.__name__, given, cls, also, without=cls.FOLLOWS)
 
     @classmethod
-    def load(cls: type[SelfCheckedFiles], path: Any, env: Any = None, *args: Any, **kwargs: Any) -> SelfCheckedFiles:
+    def load(
+        cls: type[SelfCheckedFiles],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfCheckedFiles:
         """
         It unpickles, which can run any code of the file. One of unknown origin is for ``load_untrusted`` of PEARL's.
 
         :param path: file of :meth:`save`
         :param env: to train on, or None to predict, adapt and evaluate
-        :param args: further ones of Stable-Baselines3's ``load``, of which ``device`` comes next
-        :param kwargs: these by name, and settings in place of those of the file; of ``replay_buffer_kwargs``, those that are
-            given
+        :param device: torch device, or ``"auto"``
+        :param custom_objects: in place of what the file has by these names
+        :param print_system_info: print the system that it was saved on, and this one
+        :param force_reset: reset the env before training goes on
+        :param kwargs: settings in place of those of the file; of ``replay_buffer_kwargs``, those that are given
         :return: the model
         :raises ValueError: for an unknown setting, or a file of another algorithm
         :raises OSError: if there is no such file, or it is a folder
@@ -86,7 +98,7 @@ class CheckedFiles(BaseAlgorithm):
         if not isinstance(path, io.IOBase) and pathlib.Path(path).is_dir():
             path = _beside(pathlib.Path(path))
         if {"ent_coef", "replay_buffer_kwargs"} & kwargs.keys():
-            theirs = cls._settings(path, kwargs.get("custom_objects"))
+            theirs = cls._settings(path, custom_objects)
             if "ent_coef" in kwargs and isinstance(kwargs["ent_coef"], str) != isinstance(theirs.get("ent_coef"), str):
                 raise ValueError(
                     f"ent_coef is {kwargs['ent_coef']!r}, and that of the file is of the other kind, a number or learnt "
@@ -95,14 +107,14 @@ class CheckedFiles(BaseAlgorithm):
             if "replay_buffer_kwargs" in kwargs:
                 of_both = (theirs.get("replay_buffer_kwargs"), kwargs["replay_buffer_kwargs"])
                 kwargs["replay_buffer_kwargs"] = {name: x for given in of_both for name, x in (given or {}).items()}
-        model = super().load(path, env, *args, **kwargs)
+        model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         state = vars(model)
         if "ent_coef_tensor" in state:  # SB3 has put that of the file in the place of one that was given
             state["ent_coef_tensor"] = th.tensor(float(state["ent_coef"]), device=model.device)
         return model
 
     @staticmethod
-    def _settings(path: Any, custom_objects: dict[str, Any] | None) -> dict[str, Any]:
+    def _settings(path: str | pathlib.Path | io.BufferedIOBase, custom_objects: dict[str, Any] | None) -> dict[str, Any]:
         """Of a file."""
         data, _, _ = load_from_zip_file(path, custom_objects=custom_objects, device="cpu")
         if isinstance(path, io.IOBase):

@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
+from numpy.typing import ArrayLike
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.sac import SAC
 
@@ -79,7 +80,7 @@ class MetaTest(SAC):
         self,
         env: gym.Env | VecEnv | str,
         n_episodes: int = 5,
-        task: int | np.ndarray | None = None,
+        task: ArrayLike | None = None,
         explorer: Explorer | dict[str, Any] | str | None = None,
         deterministic: bool = True,
         seed: int = 0,
@@ -142,7 +143,7 @@ class MetaTest(SAC):
         return AdaptedAgent(self.policy, adaptation.explorer.final_z()[0], returns, successes)
 
     @staticmethod
-    def _give_task(env: VecEnv, task: int | np.ndarray | None) -> np.ndarray | None:
+    def _give_task(env: VecEnv, task: ArrayLike | None) -> np.ndarray | None:
         """
         Have an env begin its next episode on a task.
 

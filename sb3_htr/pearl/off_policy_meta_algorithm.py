@@ -99,7 +99,7 @@ class OffPolicyMetaAlgorithm(MetaTest, ReplayFiles, CheckedFiles, SAC):
         replay_buffer_class: type[MultiTaskReplayBuffer] | None,
         replay_buffer_kwargs: dict[str, Any] | None,
         policy_kwargs: dict[str, Any] | None,
-        seed: int | None,
+        seed: int | np.integer[Any] | None,
         **kwargs: Any,
     ) -> None:
         checks.check_device(kwargs.get("device", "auto"))

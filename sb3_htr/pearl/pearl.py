@@ -2,6 +2,7 @@
 
 from typing import Any, ClassVar
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
@@ -136,7 +137,7 @@ class PEARL(OffPolicyMetaAlgorithm):
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
         verbose: int = 0,
-        seed: int | None = None,
+        seed: int | np.integer[Any] | None = None,
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ) -> None:

@@ -241,8 +241,8 @@ def test_adapt_keeps_one_task_when_the_env_has_none(tiny_pearl: MakePEARL) -> No
         (lambda m: m.adapt(ENV_ID, task=0, explorer={"name": "prior", "scale": 1}), "explorer 'prior' has no setting 'scale'"),
         (lambda m: evaluate_adaptation(m, gym.make_vec(ENV_ID, 2)), "VectorEnv"),  # type: ignore[arg-type]
         (lambda m: evaluate_adaptation(m, None), "There is no env: pass one"),  # type: ignore[arg-type]
-        (lambda m: MetaEvalCallback(gym.make_vec(ENV_ID, 2)), "VectorEnv"),
-        (lambda m: evaluate_adaptation(m, ENV_ID, explorer=3), "explorer is 3, expected one of"),
+        (lambda m: MetaEvalCallback(gym.make_vec(ENV_ID, 2)), "VectorEnv"),  # type: ignore[arg-type]
+        (lambda m: evaluate_adaptation(m, ENV_ID, explorer=3), "explorer is 3, expected one of"),  # type: ignore[arg-type]
         (lambda m: evaluate_adaptation(m, ENV_ID, n_episodes=0), "n_episodes is 0"),
         (lambda m: evaluate_adaptation(m, ENV_ID, np.zeros((0, 2))), "at least one task"),
         (lambda m: evaluate_adaptation(m, ENV_ID, np.zeros(2)), r"expected \(n_tasks, task_dim\)"),

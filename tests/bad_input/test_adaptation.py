@@ -211,7 +211,7 @@ def test_what_evaluations_are_given_by_mistake(tiny_pearl: MakePEARL) -> None:
     with pytest.raises(ValueError, match=r"tasks is 'valid', expected one of \['test', 'validation', 'train'\]"):
         evaluate_adaptation(model, ENV_ID, tasks="valid")
     with pytest.raises(ValueError, match=r"tasks have shape \(\), expected \(n_tasks, task_dim\)"):
-        evaluate_adaptation(model, ENV_ID, 5)  # type: ignore[arg-type]
+        evaluate_adaptation(model, ENV_ID, 5)
     with pytest.warns(UserWarning, match="No reward"):
         agent = model.adapt(gym.make(ENV_ID), n_episodes=1)
     with pytest.raises(ValueError, match=r"AdaptedAgent does not adapt: .*evaluate_policy"):

@@ -376,7 +376,7 @@ def test_a_file_is_loaded_as_what_it_is_and_with_settings_that_are_known(tiny_pe
         with pytest.raises(ValueError, match=f"{rival.__name__} has no policies such as PEARLPolicy"):
             rival.load(tmp_path / "model")
     with pytest.raises(ValueError, match=f"The env is the id '{ENV_ID}', expected an env: make it with"):
-        PEARL.load(tmp_path / "model", env=ENV_ID)
+        PEARL.load(tmp_path / "model", env=ENV_ID)  # type: ignore[arg-type]
 
 
 def test_networks_of_default_sizes_are_read_without_trust(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
