@@ -154,7 +154,7 @@ def methods() -> dict[str, Method]:
     """
     :return: all methods by their names, in the order in which tables and pictures have them
     """
-    content = yaml.safe_load(hyperparams_file("methods.yml").read_text())
+    content = yaml.safe_load(hyperparams_file("methods.yml").read_text(encoding="utf-8"))
     own = [_method(name, **settings) for name, settings in content.items()]
     under_prior = [method.under_prior() for method in own if isinstance(method, PEARLMethod)]
     return {method.name: method for method in (*own, *under_prior)}
