@@ -7,14 +7,16 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+import torch as th
 from filelock import Timeout
 
 import htr_envs  # noqa: F401 registers the envs
 from htr_envs.goal_env import find_hidden
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.common.checkpoint import checkpoints
+from sb3_htr.common.checkpoint import DamagedCheckpoint, checkpoints, read_checkpoint
 from sb3_htr.common.digest import digest_of_code
+from sb3_htr.common.errors import reason
 from sb3_htr.common.settings import name_of
 from sb3_htr.common.versions import UNKNOWN_HARDWARE, commit, hardware, named, versions
 from sb3_htr.experiments.cell import MOVE, REMOVE, Cell, Evaluation
@@ -22,7 +24,7 @@ from sb3_htr.experiments.evaluation_cache import FOLDER, EvaluationCache
 from sb3_htr.experiments.log import logged
 from sb3_htr.experiments.protocol import check_evaluations, evaluate
 from sb3_htr.zoo.commands import train
-from sb3_htr.zoo.run.agents import agent_at, file_stem, find_runs, is_finished, n_steps_of
+from sb3_htr.zoo.run.agents import agent_at, file_stem, find_runs, is_finished
 from sb3_htr.zoo.run.algorithm import Model
 from sb3_htr.zoo.run.folder import SystemLock, run_number
 from sb3_htr.zoo.run.method import get_method, merged
@@ -115,14 +117,20 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
         train.main(["--resume", str(unfinished[-1]), *packages] if unfinished else cell.training(folder))
         trained = find_finished(cell, folder)
         if trained is None:
-            run = find_runs(folder)[-1]
-            if n_steps_of(run, cell.env_id) >= cell.n_timesteps:
-                raise OSError(f"{run} has its last model, but its last checkpoint could not be written: make room for it.")
             raise KeyboardInterrupt
     run, model = trained
+    _restore(run)
     advice = f"Its run has to be trained again: remove {folder}."
-    evaluations = load_arrays(run / "evaluations.npz", ("timesteps", "results", "successes"), advice)
-    progress = np.genfromtxt(run / "progress.csv", delimiter=",", names=True, deletechars="")
+    try:
+        evaluations = load_arrays(run / "evaluations.npz", ("timesteps", "results", "successes"), advice)
+    except OSError as error:
+        raise OSError(f"{run / 'evaluations.npz'} cannot be read ({reason(error)}). {advice}") from error
+    try:
+        progress = np.atleast_1d(np.genfromtxt(run / "progress.csv", delimiter=",", names=True, deletechars=""))
+    except (OSError, ValueError, IndexError):
+        progress = np.empty(0)
+    if not len(progress):
+        raise ValueError(f"{run / 'progress.csv'} is missing or damaged. {advice}")
     columns = progress.dtype.names or ()
     record = read_record(run / RECORD)
     kept = EvaluationCache(run, agent_at(run, "last").path, cell.facts(), code)
@@ -140,6 +148,23 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
         "machine": machines(record),
         **evaluate(cell, model, record["hyperparams"].get("explorer"), kept),
     }
+
+
+def _restore(run: Path) -> None:
+    """Write its log anew, of the last checkpoint, which has a checksum: a file may be spoilt, as by a full disk."""
+    try:
+        states = [of["state"] or {} for of in read_checkpoint(checkpoints(run)[0])["callbacks"]]
+    except (IndexError, DamagedCheckpoint):  # it may have been removed
+        return
+    for state in states:
+        if "text" in state:
+            with atomic_path(run / "progress.csv") as path:
+                path.write_bytes(state["text"].encode())
+        if "successes" in state and state["returns"]:
+            returns, successes = (th.stack(state[key]).numpy() for key in ("returns", "successes"))
+            arrays: dict[str, Any] = {"results": returns[:, :, -1], "returns": returns, "successes": successes}
+            with atomic_path(run / "evaluations.npz") as path:
+                np.savez_compressed(path, timesteps=state["timesteps"], **arrays)
 
 
 def find_finished(cell: Cell, folder: Path) -> tuple[Path, Model] | None:
