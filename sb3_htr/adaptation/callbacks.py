@@ -1,7 +1,11 @@
 """Evaluation during meta-training."""
 
+import io
 import os
 import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any, cast
 
 import gymnasium as gym
@@ -15,6 +19,7 @@ from sb3_htr.adaptation.evaluation import MetaLearner, check_adapts, first_succe
 from sb3_htr.adaptation.explorers import Explorer, to_explorer
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checks import check_is_env, get_task_family
+from sb3_htr.common.digest import is_whole_zip
 from sb3_htr.common.errors import training_goes_on
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
@@ -62,6 +67,8 @@ class MetaEvalCallback(EvalCallback):
         self.explorer = explorer
         self.returns: list[np.ndarray] = []
         self.successes: list[np.ndarray] = []
+        # File of the best model as long as it could not be written
+        self._waiting = b""
 
     def state_dict(self) -> dict[str, Any]:
         """
@@ -72,11 +79,12 @@ class MetaEvalCallback(EvalCallback):
             "returns": [th.from_numpy(returns) for returns in self.returns],
             "successes": [th.from_numpy(successes) for successes in self.successes],
             "best_mean_reward": float(self.best_mean_reward),
+            "waiting": th.from_numpy(np.frombuffer(self._waiting, np.uint8).copy()),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """
-        :param state: of :meth:`state_dict`
+        :param state: of :meth:`state_dict`; that the best model is gone is warned of
         :raises ValueError: if its evaluations are of other numbers of tasks and episodes, as they go into one file
         """
         shape = len(self.tasks), self.n_eval_episodes
@@ -91,6 +99,18 @@ class MetaEvalCallback(EvalCallback):
         self.returns = [returns.numpy() for returns in state["returns"]]
         self.successes = [successes.numpy() for successes in state["successes"]]
         self.best_mean_reward = state["best_mean_reward"]
+        self._waiting = state["waiting"].numpy().tobytes() if "waiting" in state else b""  # older checkpoints have none
+        saved = self.best_model_save_path and self.best_mean_reward > -np.inf and not self._waiting
+        if saved and not is_whole_zip(Path(self._best_model)):
+            warnings.warn(
+                f"{self._best_model}, the best model so far, is missing or damaged: it is written again when one is better "
+                f"than its {self.best_mean_reward:.2f}.",
+                stacklevel=2,
+            )
+
+    @property
+    def _best_model(self) -> str:
+        return f"{self.best_model_save_path}/best_model.zip"
 
     def _init_callback(self) -> None:
         if _share_an_env(self.eval_env, self.model.get_env()):
@@ -116,9 +136,8 @@ class MetaEvalCallback(EvalCallback):
         # Of a training that is shorter than the time between two evaluations, and was not interrupted
         if self.eval_freq > 0 and not self.returns and self.num_timesteps >= self.model._total_timesteps:
             self._evaluate()
-        elif self.returns:
-            # No later one makes up for a file that could not be written
-            self._save_results()
+        # No later one makes up for a file that could not be written
+        self._write()
 
     def _evaluate(self) -> bool:
         """Whether training goes on."""
@@ -133,16 +152,15 @@ class MetaEvalCallback(EvalCallback):
         self.evaluations_timesteps.append(self.num_timesteps)
         self.returns.append(record.returns)
         self.successes.append(record.successes)
-        self._save_results()
+        self._write()
         self.last_mean_reward = float(record.returns[:, -1].mean())
         self._log(record.returns, record.successes)
         continue_training = True
         if self.last_mean_reward > self.best_mean_reward:
-            best_model = f"{self.best_model_save_path}/best_model.zip"
-            with training_goes_on(best_model):
-                if self.best_model_save_path:
-                    self.model.save(best_model)
-                # Not by a model that could not be written, which must not keep a later one from being written
+            if self.best_model_save_path:
+                with training_goes_on(self._best_model):
+                    self._write_best(new=True)
+            else:
                 self.best_mean_reward = self.last_mean_reward
             if self.callback_on_new_best is not None:
                 continue_training = self.callback_on_new_best.on_step()
@@ -150,12 +168,21 @@ class MetaEvalCallback(EvalCallback):
             continue_training = continue_training and self._on_event()
         return continue_training
 
-    def _save_results(self) -> None:
-        if self.log_path is None:
-            return
-        path = f"{self.log_path}.npz"
+    def to_write(self) -> dict[str, Callable[[], None]]:
+        """
+        :return: files, and what writes them, of all that a full disk may have kept from being written
+        """
+        results = {f"{self.log_path}.npz": self._write_results} if self.log_path and self.returns else {}
+        return results | ({self._best_model: self._write_best} if self._waiting else {})
+
+    def _write(self) -> None:
+        for path, write in self.to_write().items():
+            with training_goes_on(path):
+                write()
+
+    def _write_results(self) -> None:
         # Everything so far, so a file that could not be written is made up for by the next one
-        with training_goes_on(path), atomic_path(path) as temporary:
+        with atomic_path(f"{self.log_path}.npz") as temporary:
             np.savez_compressed(
                 temporary,
                 timesteps=self.evaluations_timesteps,
@@ -163,6 +190,15 @@ class MetaEvalCallback(EvalCallback):
                 returns=np.stack(self.returns),
                 successes=np.stack(self.successes),
             )
+
+    def _write_best(self, new: bool = False) -> None:
+        with atomic_path(self._best_model) as temporary:
+            if new:
+                # Not by a model that a wrong clock keeps from being saved at all, but by one that waits for room
+                self.model.save(content := io.BytesIO())
+                self._waiting, self.best_mean_reward = content.getvalue(), self.last_mean_reward
+            temporary.write_bytes(self._waiting)
+        self._waiting = b""
 
     def _log(self, returns: np.ndarray, successes: np.ndarray) -> None:
         self.logger.record("eval/mean_reward", self.last_mean_reward)

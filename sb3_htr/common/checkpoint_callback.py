@@ -215,13 +215,12 @@ class CheckpointCallback(BaseCallback):
         elif self.n_calls == 0:
             self._state()  # what cannot be saved says so before any work is done
 
-    def _save(self) -> None:
+    def _save(self, then: str = "Training goes on, and tries again before the next rollout.") -> None:
         folder = self.run / CHECKPOINTS / f"{self.num_timesteps}_steps"
         self._stopped = self.stopping
         try:
             write_checkpoint(folder, self._state())
         except OSError as error:
-            then = "Training goes on, and tries again before the next rollout."
             if self._stopped:
                 then = "Training stops as it was asked to: what was trained since the checkpoint before is lost."
             warnings.warn(f"The checkpoint {folder} could not be written ({reason(error)}). {then}", stacklevel=2)
@@ -235,7 +234,7 @@ class CheckpointCallback(BaseCallback):
     def _on_training_end(self) -> None:
         # Not in the middle of a rollout, where a callback may have stopped
         if not self._stopped and self.num_timesteps >= self.model._total_timesteps and self.n_calls > self._last_calls:
-            self._save()
+            self._save("The training is at its end, and can go on from the checkpoint before alone, if there is one.")
         # A process killed between writing its last checkpoint and cleaning up leaves that to the one that goes on
         self._remove_old()
 

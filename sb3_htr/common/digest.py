@@ -2,6 +2,8 @@
 
 import hashlib
 import sys
+import zipfile
+import zlib
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -33,3 +35,15 @@ def digest_of_code(modules: Iterable[str]) -> str:
         inside = [file for folder in folders for file in sorted(folder.rglob("*")) if file.is_file()]
         files += [file for file in inside if file.suffix != ".pyc"] if folders else [Path(outermost.__file__ or "")]
     return sha256(*files)
+
+
+def is_whole_zip(path: Path) -> bool:
+    """
+    :param path: of a zip file, as models are
+    :return: whether it is there, and what its checksums say
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return archive.testzip() is None
+    except (OSError, zipfile.BadZipFile, zlib.error, NotImplementedError, ValueError):
+        return False

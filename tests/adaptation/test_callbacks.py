@@ -50,6 +50,53 @@ def test_a_worse_model_of_a_training_that_goes_on_is_not_the_best(
     assert (then.last_mean_reward, then.best_mean_reward) == (3.0, 5.0)
 
 
+def test_the_best_model_waits_for_room(tiny_pearl: MakePEARL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also in a checkpoint; a worse one does not take its place."""
+    import sb3_htr.adaptation.callbacks as module
+
+    scores, save = iter((5.0, 3.0, 2.0)), dict[str, Any](best_model_save_path=str(tmp_path))
+    path = tmp_path / "best_model.zip"
+
+    def scripted(*_: Any, **__: Any) -> AdaptationRecord:
+        return AdaptationRecord(np.full((20, 1), next(scores)), np.zeros((20, 1), bool), np.zeros((20, 1, 1, 2)))
+
+    def full(*_: Any) -> Any:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(module, "record_adaptation", scripted)
+    first, then, last = (MetaEvalCallback(ENV_ID, eval_freq=60, n_eval_episodes=1, verbose=0, **save) for _ in range(3))
+    model = tiny_pearl()
+    with monkeypatch.context() as patch:
+        patch.setattr("sb3_htr.common.atomic.os.replace", full)
+        with pytest.warns(UserWarning, match=r"best_model\.zip could not be written \(No space .*Training goes on"):
+            model.learn(ROLLOUT, first)
+    assert not path.exists()
+    then.load_state_dict(first.state_dict())
+    model.learn(ROLLOUT, then, reset_num_timesteps=False)
+    assert PEARL.load(path).num_timesteps == ROLLOUT and then.best_mean_reward == 5.0
+    written = path.stat().st_mtime_ns
+    last.load_state_dict(then.state_dict())
+    model.learn(ROLLOUT, last, reset_num_timesteps=False)
+    assert path.stat().st_mtime_ns == written, "once"
+
+
+@pytest.mark.parametrize("damage", [None, b"half"])
+def test_a_best_model_that_is_gone_is_told_of_when_a_training_goes_on(
+    damage: bytes | None, tiny_pearl: MakePEARL, tmp_path: Path
+) -> None:
+    before, after = (
+        MetaEvalCallback(ENV_ID, eval_freq=60, n_eval_episodes=1, verbose=0, best_model_save_path=str(tmp_path))
+        for _ in range(2)
+    )
+    after.load_state_dict(before.state_dict())  # there is none yet
+    tiny_pearl().learn(ROLLOUT, before)
+    after.load_state_dict(before.state_dict())
+    path = tmp_path / "best_model.zip"
+    path.unlink() if damage is None else path.write_bytes(damage)
+    with pytest.warns(UserWarning, match=rf"{path}, the best model so far, is missing or damaged"):
+        after.load_state_dict(before.state_dict())
+
+
 def test_a_training_shorter_than_the_time_between_evaluations_is_evaluated_at_its_end(
     tiny_pearl: MakePEARL, tmp_path: Path
 ) -> None:

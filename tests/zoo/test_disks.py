@@ -1,6 +1,8 @@
 """A disk that fills up ends no training, and what was lost for want of it comes back."""
 
 import errno
+import re
+import shutil
 import subprocess
 import warnings
 from collections.abc import Callable
@@ -51,9 +53,8 @@ def test_a_disk_of_any_size(kilobytes: int, lost: str, unbroken: dict[str, th.Te
             refused = str(error)
         assert any(lost in str(warning.message) and "Training goes on" in str(warning.message) for warning in said)
         run = run_folder(folder)
-        assert (run / f"{ENV_ID}.zip").exists() == (not refused)
         if refused:
-            assert refused.startswith(f"The last model could not be written to {run} (No space left on device)")
+            assert re.search(rf"{run}/?\S* could not be written", refused)
             assert (f"--resume {run}" if checkpoints(run) else "train again") in refused
         if checkpoints(run):
             subprocess.run(["mount", "-o", "remount,size=40000k", str(folder)], check=True)
@@ -61,6 +62,69 @@ def test_a_disk_of_any_size(kilobytes: int, lost: str, unbroken: dict[str, th.Te
             assert main(["train", "--resume", str(run)]) == 0
             for name, values in parameters(folder).items():
                 assert th.equal(values, unbroken[name]), name
+            for name in ("best_model.zip", "evaluations.npz", "progress.csv", "checkpoints/960_steps"):
+                assert (run / name).exists(), name
+
+
+@pytest.mark.parametrize(
+    ("writer", "lost"),
+    [
+        ("numpy.savez_compressed", "evaluations.npz"),
+        ("sb3_htr.PEARL.save_replay_buffer", "replay_buffer.pkl"),
+        ("sb3_htr.PEARL.save", f"{ENV_ID}.zip"),
+        ("sb3_htr.zoo.run.callbacks.PatientCSV.save", "progress.csv"),
+    ],
+)
+def test_what_had_no_room_at_the_end_is_said_and_comes_back(
+    writer: str, lost: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run without it is not finished."""
+    arguments = train_arguments(tmp_path, 480, *SETTINGS, "--save-replay-buffer", eval_freq=240)
+    run = run_folder(tmp_path)
+
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch, warnings.catch_warnings(record=True):
+        patch.setattr(writer, full)
+        with pytest.raises(
+            OSError, match=rf"^{run / lost} could not be written \(No space .* and `sb3-htr train --resume {run}` goes on"
+        ):
+            main(arguments)
+    assert not (run / lost).exists()
+    assert main(["train", "--resume", str(run)]) == 0
+    assert (run / lost).exists() and (run / f"{ENV_ID}.zip").exists()
+
+
+def test_what_no_checkpoint_has_is_written_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(PEARL, "save_replay_buffer", full)
+    with pytest.raises(OSError, match=r"replay_buffer\.pkl could not be written .* there is no checkpoint"):
+        main(train_arguments(tmp_path, 480, "--save-freq", "-1", "--save-replay-buffer"))
+    assert (run_folder(tmp_path) / f"{ENV_ID}.zip").exists()
+
+
+def test_a_run_that_was_removed_is_told_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    save, run = PEARL.save, run_folder(tmp_path)
+
+    def removed(*args: Any) -> None:
+        shutil.rmtree(run)
+        save(*args)
+
+    monkeypatch.setattr(PEARL, "save", removed)
+    with pytest.raises(OSError, match=rf"{run} was removed during the training: .* last model"):
+        main(train_arguments(tmp_path, 480))
+
+
+def test_a_disk_that_is_full_before_the_training_has_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("sb3_htr.zoo.run.training_manager.write_record", full)
+    with pytest.raises(OSError, match=rf"No space left on device: '{run_folder(tmp_path)}'"):
+        main(train_arguments(tmp_path, 480))
 
 
 class Then(BaseCallback):
@@ -173,7 +237,7 @@ def test_a_wrong_clock_ends_no_training(seconds: float, tmp_path: Path, monkeypa
         pytest.warns(UserWarning, match=r"best_model.zip could not be written .*Training goes on"),
     ):
         wrong.setattr("time.time", lambda: seconds)
-        with pytest.raises(OSError, match=r"The last model could not be written .*: mend that, and `sb3-htr train --resume"):
+        with pytest.raises(OSError, match=rf"{ENV_ID}\.zip could not be written .*: mend that, and `sb3-htr train --resume"):
             main(train_arguments(tmp_path, 480, *SETTINGS, eval_freq=240))
     run = run_folder(tmp_path)
     assert [folder.name for folder in checkpoints(run)] == ["480_steps", "240_steps"]

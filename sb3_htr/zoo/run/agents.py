@@ -6,7 +6,6 @@ import json
 import os
 import sys
 import zipfile
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
@@ -20,6 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 import htr_envs  # noqa: F401 registers the envs
 from sb3_htr.common.checkpoint import checkpoints, n_steps_done
 from sb3_htr.common.checks import check_device
+from sb3_htr.common.digest import is_whole_zip
 from sb3_htr.common.errors import last_line
 from sb3_htr.common.settings import name_of
 from sb3_htr.common.vec_env import make_task_vec_env
@@ -158,12 +158,14 @@ def n_steps_of(run: Path, env_id: str) -> int:
     :param env_id: env that it was trained on
     :return: env steps that its last model was trained for, 0 if there is none, or it is damaged or does not say
     """
+    path = run / f"{file_stem(env_id)}.zip"
     try:
-        with zipfile.ZipFile(run / f"{file_stem(env_id)}.zip") as archive:
-            n_steps = int(json.loads(archive.read("data"))["num_timesteps"])
-            return 0 if archive.testzip() else n_steps
-    except (OSError, zipfile.BadZipFile, zlib.error, NotImplementedError, KeyError, TypeError, ValueError):
-        return 0
+        if is_whole_zip(path):
+            with zipfile.ZipFile(path) as archive:
+                return int(json.loads(archive.read("data"))["num_timesteps"])
+    except (RuntimeError, KeyError, TypeError, ValueError):
+        pass
+    return 0
 
 
 def is_finished(run: Path, env_id: str, n_timesteps: int) -> bool:

@@ -2,7 +2,7 @@
 
 import contextlib
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ class PatientCSV(CSVOutputFormat):
         self.file.close()
         self.path, self.keys, self.file = path, list(keys), StringIO()
         self.file.write(text)
-        self._is_whole = False
+        self.is_whole = False
         self._put("")
 
     @property
@@ -48,15 +48,15 @@ class PatientCSV(CSVOutputFormat):
 
     def _put(self, before: str) -> None:
         """Into the file, which has what was before, unless that failed."""
-        can_append = self._is_whole and self.path.exists() and self.text.startswith(before)
-        self._is_whole = False
+        can_append = self.is_whole and self.path.exists() and self.text.startswith(before)
+        self.is_whole = False
         with training_goes_on(str(self.path)):
             if can_append:
                 with self.path.open("ab") as file:
                     file.write(self.text[len(before) :].encode())
             else:  # of a stranger's run it may be a link, to a file that is not the run's
                 self.save()
-            self._is_whole = True
+            self.is_whole = True
 
     def save(self) -> None:
         """Write all of it."""
@@ -64,7 +64,7 @@ class PatientCSV(CSVOutputFormat):
             temporary.write_bytes(self.text.encode())
 
     def close(self) -> None:
-        if not self._is_whole:
+        if not self.is_whole:
             self._put("")
 
 
@@ -101,11 +101,13 @@ class ProgressCallback(BaseCallback):
         super().__init__()
         self.path = Path(path)
         self._written: dict[str, Any] = {"keys": [], "text": ""}
+        self._output: PatientCSV | None = None
 
     def state_dict(self) -> dict[str, Any]:
         """
         :return: what was written so far
         """
+        assert self._output is not None, "a training has begun"
         return {"keys": list(self._output.keys), "text": self._output.text}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -123,7 +125,14 @@ class ProgressCallback(BaseCallback):
     def _on_step(self) -> bool:
         return True
 
+    def to_write(self) -> dict[str, Callable[[], None]]:
+        """
+        :return: the file, and what writes it, if a full disk has kept some of it from being written
+        """
+        return {str(self.path): self._output.save} if self._output is not None and not self._output.is_whole else {}
+
     def _on_training_end(self) -> None:
+        assert self._output is not None
         self.logger.output_formats.remove(self._output)
         self._output.close()
 

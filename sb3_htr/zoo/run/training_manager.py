@@ -1,10 +1,13 @@
 """One training by rl_zoo3: its folder, its checkpoints, its record, and how it ends."""
 
 import contextlib
+import errno
 import importlib
 import shutil
 import sys
+from collections.abc import Callable
 from datetime import datetime, timezone
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -12,7 +15,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_htr.common.checkpoint import checkpoints, load_latest
+from sb3_htr.adaptation.callbacks import MetaEvalCallback
+from sb3_htr.common.checkpoint import checkpoints, load_latest, n_steps_done
 from sb3_htr.common.checkpoint_callback import CheckpointCallback, cut_monitor_files
 from sb3_htr.common.divergence import DivergedError
 from sb3_htr.common.errors import reason
@@ -79,11 +83,13 @@ class TrainingManager(MetaExperimentManager):
         """
         try:
             return super().setup_experiment()
-        except BaseException:
+        except BaseException as error:
             if self._claimed is not None:  # nothing was trained in it
                 shutil.rmtree(self._claimed)
             if self._lock is not None:
                 self._lock.release()
+            if isinstance(error, OSError) and error.filename is None and error.errno == errno.ENOSPC:
+                raise OSError(error.errno, error.strerror, self.save_path) from error
             raise
 
     def create_log_folder(self) -> None:
@@ -99,6 +105,8 @@ class TrainingManager(MetaExperimentManager):
         else:
             self.save_path = str(self.resumed)
             self._lock = lock(self.resumed)
+            for left in self.resumed.glob(".*.tmp*"):  # by a process that was killed
+                left.unlink()
             folder, self._checkpoint = load_latest(self.resumed)
             cut_monitor_files(self.resumed, folder, self._checkpoint["monitor_files"])
             print(f"Going on from {folder}")
@@ -186,27 +194,45 @@ class TrainingManager(MetaExperimentManager):
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         """
+        Write the last model, and before it all that could not be written yet: a run that has its last model is finished.
+
         :param model: at the end of its training
-        :raises OSError: if it cannot be written
-        :raises KeyboardInterrupt: when it is written, if the training was interrupted: a script should not go on
+        :raises OSError: if something cannot be written, or the folder was removed during the training
+        :raises KeyboardInterrupt: when all is written, if the training was interrupted: a script should not go on
         """
+        run = Path(self.save_path)
+        # As rl_zoo3 does, but that of an id with a dot, what is behind it is no suffix
+        last = f"{run / self.env_name}.zip"
+        writes: dict[str, Callable[[], None]] = {last: partial(model.save, last)}
+        for callback in self.callbacks:
+            if isinstance(callback, MetaEvalCallback | ProgressCallback):
+                writes = callback.to_write() | writes
+        if self.save_replay_buffer and hasattr(model, "save_replay_buffer"):
+            buffer = f"{run / 'replay_buffer.pkl'}"
+            writes = {buffer: partial(model.save_replay_buffer, buffer)} | writes
+        if not checkpoints(run):  # nothing else has what was learned
+            writes = dict(reversed(writes.items()))
         try:
-            # As rl_zoo3 does, but that of an id with a dot, what is behind it is no suffix
-            model.save(f"{self.save_path}/{self.env_name}.zip")
-            if self.save_replay_buffer and hasattr(model, "save_replay_buffer"):
-                model.save_replay_buffer(Path(self.save_path, "replay_buffer.pkl"))
-        except OSError as error:
-            again = f"`{self._to_go_on()}` goes on from the last checkpoint"
-            if not checkpoints(Path(self.save_path)):
-                again = "train again, as there is no checkpoint either"
-            raise OSError(
-                f"The last model could not be written to {self.save_path} ({reason(error)}): mend that, and {again}."
-            ) from error
+            for path, write in writes.items():
+                try:
+                    write()
+                except OSError as error:
+                    raise self._unwritten(path, f" ({reason(error)})") from error
         finally:
             assert self._lock is not None
             self._lock.release()
+        if not (run / RECORD).exists():
+            raise OSError(f"{run} was removed during the training: it has the last model, and no {RECORD}.")
         if self._interrupted:
             raise KeyboardInterrupt
+        if self._checkpointing is not None and n_steps_done(run) < self.n_timesteps <= model.num_timesteps:
+            raise self._unwritten(f"The last checkpoint of {run}")
+
+    def _unwritten(self, what: str, why: str = "") -> OSError:
+        again = "train again, as there is no checkpoint"
+        if checkpoints(Path(self.save_path)):
+            again = f"`{self._to_go_on()}` goes on from the last checkpoint"
+        return OSError(f"{what} could not be written{why}: mend that, and {again}.")
 
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
         # As used: -n may have replaced the file's
