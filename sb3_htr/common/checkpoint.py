@@ -20,7 +20,7 @@ CHECKPOINTS = "checkpoints"
 
 
 # What is read again without running code: these types themselves, as a subclass is written by its name
-LEAVES = (bool, int, float, complex, str, bytes, type(None))
+LEAVES = (bool, int, float, complex, str, type(None))
 
 
 class DamagedCheckpoint(ValueError):
