@@ -519,18 +519,6 @@ def test_a_method_all_of_whose_parts_are_ones_own(own_module: str, tmp_path: Pat
     assert "--gym-packages half_half --trust\n" in (cards / "trusted" / "README.md").read_text()
 
 
-class Aimless(Lattice):
-    """Sets no z."""
-
-    def start(self) -> None:
-        self.found = np.zeros(self.adaptation.n_envs, dtype=bool)
-
-
-def test_an_explorer_without_z_is_told_of(tiny_pearl: MakePEARL) -> None:
-    with pytest.raises(ValueError, match=r"The z of the explorer 'aimless' has shape \(\), expected \(\d+, \d+\)"):
-        evaluate_adaptation(tiny_pearl(), ENV_ID, n_episodes=1, explorer=Aimless())
-
-
 def test_a_name_is_of_one_class() -> None:
     @dataclass
     class Prior(Lattice):

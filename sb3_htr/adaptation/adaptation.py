@@ -143,8 +143,7 @@ class Adaptation:
     @property
     def z(self) -> np.ndarray:
         """(n_envs, latent_dim) float32, the task variable to act with."""
-        z = np.asarray(getattr(self.explorer, "z", None), dtype=np.float32)  # one that sets none has NaN, of no shape
-        shape = (self.n_envs, self.policy.latent_dim)
+        z, shape = np.asarray(self.explorer.z, dtype=np.float32), (self.n_envs, self.policy.latent_dim)
         if z.shape != shape:
             raise ValueError(f"The z of the explorer {self.explorer.name!r} has shape {z.shape}, expected {shape}.")
         if not np.isfinite(z).all():
