@@ -22,7 +22,7 @@ from helpers import ENV_ID, ROLLOUT, MakePEARL, parameters, with_policy
 from helpers.experience import by_task
 from helpers.runs import run_folder, train_arguments
 from htr_envs import Dynamics, DynamicsEnv, DynamicsVectorEnv, TaskFamily, at_step, check_reward_type, check_task_env
-from sb3_htr import PEARL, evaluate_adaptation
+from sb3_htr import PEARL, evaluate_adaptation, load_untrusted
 from sb3_htr.adaptation import Explorer, Step, register_explorer
 from sb3_htr.adaptation.explorers import EXPLORERS, to_explorer
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
@@ -501,7 +501,7 @@ def test_a_method_all_of_whose_parts_are_ones_own(own_module: str, tmp_path: Pat
     assert main(["experiment", "mild", *packages, *where, "--jobs", "1"]) == 0
     agent = agent_at(runs / "mild" / "mild-seed1", "last")
     model = agent.load()
-    assert isinstance(model, PEARL) and type(model).__name__ == "Mild"
+    assert isinstance(model, PEARL) and type(model).__name__ == "Mild" and model.mildness == 0.5  # type: ignore[attr-defined]
     assert (type(model.explorer).__name__, model.explorer.width) == ("Wide", 2.0)  # type: ignore[attr-defined]
     assert type(model.policy.encoder).__name__ == "Doubtful"
     assert type(model.replay_buffer.relabeller).__name__ == "Again"  # type: ignore[union-attr]
@@ -512,6 +512,9 @@ def test_a_method_all_of_whose_parts_are_ones_own(own_module: str, tmp_path: Pat
     assert main([*export, "-o", str(cards / "plain")]) == 0
     card = (cards / "plain" / "README.md").read_text()
     assert "from half_half import Mild\n" in card and "It is milder." in card and "--trust" not in card
+    more = type("More", (type(model),), {"_get_torch_save_params": lambda self: ([], [])})
+    with pytest.raises(ValueError, match=r"More has weights that PEARL has not, which only More\.load restores"):
+        load_untrusted(agent.path, ENV_ID, model_class=more)
     del EXPLORERS["wide"]
     with pytest.raises(ValueError, match=r"its explorer is a class of its own that is not registered \(sb3_htr"):
         agent.load()

@@ -158,13 +158,13 @@ def times(row: dict[str, Any]) -> str:
     :return: how many times as many env steps, or nothing where it may be any smaller and any larger; a single run has no
         interval
     """
+    never = f"{row['n_unsolved']} of {row['n_seeds']} never" if row["n_unsolved"] else ""
     if row["at_most"] and row["at_least"]:
-        return "at its first evaluation" if row["n_at_first"] == row["n_seeds"] else ""
+        return "at its first evaluation" if row["n_at_first"] == row["n_seeds"] else never
     sign = "≤ " if row["at_most"] else "≥ " if row["at_least"] else ""
     low, high = ("" if row[end] is None else f"{row[end]:.1f}" for end in ("low", "high"))
     interval = f" [{low or 0}, {f'{high}]' if high else '∞)'}" if low or high else ""
-    never = f", {row['n_unsolved']} of {row['n_seeds']} never" if row["n_unsolved"] else ""
-    return f"{sign}{row['iqm']:.1f}{interval}{never}"
+    return f"{sign}{row['iqm']:.1f}{interval}" + (never and f", {never}")
 
 
 def _interval(row: dict[str, Any]) -> str:

@@ -41,7 +41,7 @@ def check_state(owner: str, value: Any, place: str = "") -> None:
     elif type(value) in (list, tuple, set):
         for i, part in enumerate(value):
             check_state(owner, part, f"{place}[{i}]")
-    elif not isinstance(value, th.Tensor) and type(value) not in LEAVES:
+    elif type(value) not in LEAVES and not (type(value) in (th.Tensor, th.nn.Parameter) and not vars(value)):
         kind = f"{type(value).__module__}.{type(value).__qualname__}"
         raise ValueError(
             f"The state_dict() of {owner} cannot be saved: {place or 'it'} is a {kind}. It may hold tensors (torch.from_numpy "

@@ -153,14 +153,15 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
 def _restore(run: Path) -> None:
     """Write its log anew, of the last checkpoint, which has a checksum: a file may be spoilt, as by a full disk."""
     try:
-        states = [of["state"] or {} for of in read_checkpoint(checkpoints(run)[0])["callbacks"]]
+        states = [of["state"] for of in read_checkpoint(checkpoints(run)[0])["callbacks"]]
     except (IndexError, DamagedCheckpoint):  # it may have been removed
         return
-    for state in states:
-        if "text" in state:
+    # Callbacks of one's own have states of any kind
+    for state in [state for state in states if isinstance(state, dict)]:
+        if state.keys() == {"keys", "text"}:
             with atomic_path(run / "progress.csv") as path:
                 path.write_bytes(state["text"].encode())
-        if "successes" in state and state["returns"]:
+        if {"timesteps", "returns", "successes"} <= state.keys() and state["returns"]:
             returns, successes = (th.stack(state[key]).numpy() for key in ("returns", "successes"))
             arrays: dict[str, Any] = {"results": returns[:, :, -1], "returns": returns, "successes": successes}
             with atomic_path(run / "evaluations.npz") as path:

@@ -102,4 +102,4 @@ def numbers(row: dict[str, Any], digits: int) -> str:
     """
     # Adding 0 turns -0 into 0
     iqm, *ends = (f"{round(row[key], digits) + 0.0:.{digits}f}" for key in ("iqm", "low", "high") if row[key] is not None)
-    return f"{iqm} [{', '.join(ends)}]" if ends else iqm
+    return f"{iqm} [{', '.join(ends)}]" if len(ends) == 2 else iqm

@@ -65,13 +65,18 @@ def load_untrusted(
     :param env: env of a task family, as for a training, of the same spaces, which are compared with what the file says of
         them in words
     :param device: torch device
-    :param model_class: what to make of it; arguments that PEARL has not are at their defaults, or among ``kwargs``
+    :param model_class: what to make of it; what its constructor takes and PEARL's does not is at its default, or in ``kwargs``
     :param kwargs: arguments of PEARL, in place of those of the file
     :return: a model to predict, adapt and evaluate with
     :raises OSError: if there is no such file, or it cannot be opened
     :raises ValueError: if it is no such file, or its weights or spaces do not fit
     """
     model_class.check_names(kwargs)
+    if model_class._get_torch_save_params is not PEARL._get_torch_save_params:
+        raise ValueError(
+            f"{model_class.__name__} has weights that PEARL has not, which only {model_class.__name__}.load restores (on the "
+            f"command line, --trust), and that may run code of {path}."
+        )
     # As SB3's load does
     path = path if os.path.exists(path) else with_suffix(path, ".zip")
     try:

@@ -21,6 +21,7 @@ def slowdown(variant: str, *, low: float | None = None, high: float | None = Non
         (slowdown("", high=4.0, at_most=True, n_at_first=1), "≤ 3.0 [0, 4.0]"),
         (slowdown("", at_least=True, at_most=True, n_at_first=1), ""),
         (slowdown("", at_least=True, at_most=True, n_at_first=5), "at its first evaluation"),
+        (slowdown("", at_least=True, at_most=True, n_unsolved=3), "3 of 5 never"),
         (slowdown("", n_seeds=1), "3.0"),
         (slowdown("", n_seeds=1, at_least=True), "≥ 3.0"),
     ],

@@ -12,6 +12,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_htr.common.settings import keywords_of
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.pearl import PEARL, load_untrusted
 from sb3_htr.pearl.horizon import timesteps_for
@@ -105,7 +106,9 @@ class PEARLAlgorithm(Algorithm):
     """PEARL, or a class derived from it, whose files can be trained on without running code of theirs."""
 
     def _load_untrusted(self, path: Path, record: dict[str, Any], env: gym.Env, device: str) -> Model:
-        return load_untrusted(path, env, device, self.model_class)
+        # Of a class of one's own: its file has them as attributes of any name
+        given, own = record.get("hyperparams", {}), keywords_of(self.model_class) - keywords_of(PEARL)
+        return load_untrusted(path, env, device, self.model_class, **{name: given[name] for name in own & given.keys()})
 
     def check_loadable(self, hyperparams: dict[str, Any]) -> None:
         check_loadable(hyperparams)

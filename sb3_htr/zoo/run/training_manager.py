@@ -19,7 +19,7 @@ from sb3_htr.adaptation.callbacks import MetaEvalCallback
 from sb3_htr.common.checkpoint import checkpoints, load_latest, n_steps_done
 from sb3_htr.common.checkpoint_callback import CheckpointCallback, cut_monitor_files
 from sb3_htr.common.divergence import DivergedError
-from sb3_htr.common.errors import reason
+from sb3_htr.common.errors import reason, training_goes_on
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.common.versions import hardware, made_by
 from sb3_htr.zoo.run.callbacks import ProgressCallback
@@ -106,7 +106,8 @@ class TrainingManager(MetaExperimentManager):
             self.save_path = str(self.resumed)
             self._lock = lock(self.resumed)
             for left in self.resumed.glob(".*.tmp*"):  # by a process that was killed
-                left.unlink()
+                with training_goes_on(str(left), "removed"):
+                    left.unlink()
             folder, self._checkpoint = load_latest(self.resumed)
             cut_monitor_files(self.resumed, folder, self._checkpoint["monitor_files"])
             print(f"Going on from {folder}")
