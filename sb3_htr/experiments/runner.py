@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import torch as th
 from filelock import Timeout
 
 import htr_envs  # noqa: F401 registers the envs
 from htr_envs.goal_env import find_hidden
+from sb3_htr.adaptation.callbacks import write_evaluations
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checkpoint import DamagedCheckpoint, checkpoints, read_checkpoint
@@ -162,10 +162,8 @@ def _restore(run: Path) -> None:
             with atomic_path(run / "progress.csv") as path:
                 path.write_bytes(state["text"].encode())
         if {"timesteps", "returns", "successes"} <= state.keys() and state["returns"]:
-            returns, successes = (th.stack(state[key]).numpy() for key in ("returns", "successes"))
-            arrays: dict[str, Any] = {"results": returns[:, :, -1], "returns": returns, "successes": successes}
-            with atomic_path(run / "evaluations.npz") as path:
-                np.savez_compressed(path, timesteps=state["timesteps"], **arrays)
+            returns, successes = ([part.numpy() for part in state[key]] for key in ("returns", "successes"))
+            write_evaluations(run / "evaluations.npz", state["timesteps"], returns, successes)
 
 
 def find_finished(cell: Cell, folder: Path) -> tuple[Path, Model] | None:
