@@ -515,6 +515,8 @@ def test_a_method_all_of_whose_parts_are_ones_own(own_module: str, tmp_path: Pat
     more = type("More", (type(model),), {"_get_torch_save_params": lambda self: ([], [])})
     with pytest.raises(ValueError, match=r"More has weights that PEARL has not, which only More\.load restores"):
         load_untrusted(agent.path, ENV_ID, model_class=more)
+    with pytest.raises(ValueError, match="its class More has weights that PEARL has not"):  # before it is trained in a grid
+        replace(agent.algorithm, model_class=more).check_loadable({})
     del EXPLORERS["wide"]
     with pytest.raises(ValueError, match=r"its explorer is a class of its own that is not registered \(sb3_htr"):
         agent.load()

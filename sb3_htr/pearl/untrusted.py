@@ -72,14 +72,10 @@ def load_untrusted(
     :raises ValueError: if it is no such file, or its weights or spaces do not fit
     """
     model_class.check_names(kwargs)
-    if model_class._get_torch_save_params is not PEARL._get_torch_save_params:
-        raise ValueError(
-            f"{model_class.__name__} has weights that PEARL has not, which only {model_class.__name__}.load restores (on the "
-            f"command line, --trust), and that may run code of {path}."
-        )
     # As SB3's load does
     path = path if os.path.exists(path) else with_suffix(path, ".zip")
     try:
+        _check_weights(model_class)
         data, weights = read_model(path, ("policy", "knowledge"))
         _check_is_ours("policy", data["policy_class"].get("__module__", ""))
         settings: dict[str, Any] = {name: _plain(name, data[name]) for name in EXPLORERS if name not in kwargs}
@@ -130,17 +126,27 @@ def load_untrusted(
     return model
 
 
-def check_loadable(hyperparams: dict[str, Any]) -> None:
+def check_loadable(hyperparams: dict[str, Any], model_class: type[PEARL] = PEARL) -> None:
     """
     :param hyperparams: of a training to come, which looks itself at what PEARL does not know or take
+    :param model_class: what is trained
     :raises Refused: for what PEARL takes, and no file of its model may have
     """
+    _check_weights(model_class)
     given = hyperparams.get("policy_kwargs") or {}
     _check_policy_settings({name: value for name, value in given.items() if name in keywords_of(PEARLPolicy)})
     _check_memory(hyperparams)
     for name in EXPLORERS:
         if name in hyperparams:
             _check_explorer(name, str(type(explorers.to_explorer(hyperparams[name]))))
+
+
+def _check_weights(model_class: type[PEARL]) -> None:
+    if model_class._get_torch_save_params is not PEARL._get_torch_save_params:
+        raise Refused(
+            f"its class {model_class.__name__} has weights that PEARL has not, which only {model_class.__name__}.load "
+            "restores (on the command line, --trust), and that may run code of the file."
+        )
 
 
 def _check_is_ours(what: str, module: str, registered: str = "") -> None:

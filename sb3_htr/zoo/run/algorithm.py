@@ -111,7 +111,7 @@ class PEARLAlgorithm(Algorithm):
         return load_untrusted(path, env, device, self.model_class, **{name: given[name] for name in own & given.keys()})
 
     def check_loadable(self, hyperparams: dict[str, Any]) -> None:
-        check_loadable(hyperparams)
+        check_loadable(hyperparams, self.model_class)
 
     def load_to_train(self, path: str, env: VecEnv, device: th.device | str, **kwargs: Any) -> PEARL:
         return load_untrusted(path, env, device, self.model_class, **kwargs)
