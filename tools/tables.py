@@ -19,7 +19,22 @@ from sb3_htr.zoo.run.method import OWN
 RESULTS = Path(__file__).parents[1] / "results"
 DOCS = RESULTS.parent / "docs"
 DOCUMENTS = (RESULTS.parent / "README.md", *sorted(DOCS.glob("results/*.md")), DOCS / "performance.md")
-# The table of README.md, and of PEARL's own protocol: methods by their experiments; explorers with what is shown of them
+# The table of README.md: envs in words and tasks that are further away, by experiments; heads, methods, whether of such tasks
+SHORT: dict[str, tuple[str, str | None]] = {
+    "point_robot": ("Point robot", "goal distance 1.4"),
+    "wheeled": ("Wheeled robot", "goal distance 2.5"),
+    "ant": ("Ant", "goal distance 2.5"),
+    "fetch_reach": ("FetchReach, goal hidden", None),
+    "fetch_push": ("FetchPush, goal hidden", None),
+}
+SHORT_COLUMNS = (
+    ("HTR", "htr-ser", False),
+    ("further away", "htr-ser", True),
+    ("PEARL without relabelling", "pearl-sparse", False),
+    ("PEARL, dense reward in training", "pearl-dense", False),
+    ("further away", "pearl-dense", True),
+)
+# That of the results, and of PEARL's own protocol: methods by their experiments; explorers with what is shown of them
 HEADLINES: dict[str, dict[str, tuple[str, ...]]] = {
     "headline": {
         "point_robot": ("htr-ser", "pearl-dense", "pearl-sparse"),
@@ -61,6 +76,25 @@ COMPARED: dict[str, dict[str, tuple[str, ...]]] = {
 PASSED = ("target_speed",)
 # Adaptation episodes, of 20, after which the tasks that are solved are shown
 EARLY = (1, 2, 5)
+
+
+def short(summaries: dict[str, dict[str, Any]]) -> str:
+    """
+    :param summaries: contents of ``summary.json`` by their names
+    :return: Markdown table, one line per env: how many test tasks are solved by ``belief``
+    """
+    lines = []
+    for name, (env, further) in SHORT.items():
+        rows: dict[tuple[str, str | None], dict[str, Any]] = {
+            (row["variant"], place(row)): row
+            for row in summaries[name]["rows"]
+            if row["metric"] == "success_rate" and row["explorer"] == "belief"
+        }
+        shown = [rows.get((method, further if away else "")) for _, method, away in SHORT_COLUMNS]
+        n_runs = min(row["n_seeds"] for row in shown if row)
+        few = f"; {n_runs} runs" if n_runs < MIN_RUNS else ""
+        lines.append([env + few, *(_interval(row) if row else "" for row in shown)])
+    return markdown_table(["", *(head for head, *_ in SHORT_COLUMNS)], lines) + "\n"
 
 
 def headline(summaries: dict[str, dict[str, Any]], methods_of: dict[str, tuple[str, ...]], results: Path = RESULTS) -> str:
@@ -211,6 +245,7 @@ def tables() -> dict[str, str]:
     own = {f"results:{summary['name']}": table(summary) for summary in summaries}
     by_name = {summary["name"]: summary for summary in summaries}
     headlines = {name: headline(by_name, methods_of) for name, methods_of in HEADLINES.items()}
+    headlines["headline:short"] = short(by_name)
     headlines["headline:rivals"] = rivals(by_name["rivals"])
     return {**own, **headlines, **{name: differences(by_name, methods_of) for name, methods_of in COMPARED.items()}}
 
