@@ -22,10 +22,8 @@ from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.common.versions import commit, hardware, named
 from sb3_htr.htr import MultiTaskReplayBuffer
-from sb3_htr.zoo.run.malloc import keep_freed_memory
 
 # As sb3-htr train does
-keep_freed_memory()
 
 ENV_ID = "SparsePointRobot-v0"
 RESULTS = Path(__file__).parent / "results"

@@ -269,12 +269,6 @@ def test_a_training_leaves_the_process_as_it_was(tmp_path: Path) -> None:
     assert sys.argv == before
 
 
-def test_the_c_library_is_asked_where_it_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert keep_freed_memory() is (platform.libc_ver()[0] == "glibc")
-    monkeypatch.setattr("ctypes.CDLL", lambda name: object())
-    assert keep_freed_memory() is False
-
-
 def test_help_and_mistakes(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main(["--help"]) == 0 and "evaluate" in capsys.readouterr().out
     assert main([]) == 2 and "usage: sb3-htr" in capsys.readouterr().err

@@ -12,7 +12,6 @@ import gymnasium as gym
 from htr_envs.goal_env import NAMESPACE, find_hidden
 from sb3_htr.common.checkpoint import n_steps_done
 from sb3_htr.zoo.run.agents import find_runs, is_finished, n_steps_of
-from sb3_htr.zoo.run.malloc import keep_freed_memory
 from sb3_htr.zoo.run.method import DEFAULT, get_method, methods
 from sb3_htr.zoo.run.record import OF_TRAINING, RECORD, arguments_to_go_on, command_to_go_on, read_record
 from sb3_htr.zoo.run.rl_zoo import run_rl_zoo
@@ -117,7 +116,6 @@ def main(argv: Sequence[str]) -> None:
             _check_id(args.env)
     if (weights := value_of(given, *WEIGHTS)) is not None and not Path(weights).is_file():
         raise FileNotFoundError(f"There is no model {weights} to begin with: -i takes a file of `sb3-htr train` or `export`.")
-    keep_freed_memory()
     try:
         run_rl_zoo(program, algorithm, [*default_arguments(algorithm), *given], args.method, run, args.trust)
     except (NameError, SyntaxError) as error:
