@@ -61,7 +61,6 @@ class EpisodeStore:
     :param episodes_per_task: capacity of each task's ring, in episodes; then the oldest episode is overwritten
     :param episode_length: largest number of steps of an episode
     :param row_dim: number of columns of a transition
-    :param in_order: whether the transitions of an episode followed each other; if not, targets are of one step
     """
 
     #: How often something was written
@@ -69,8 +68,7 @@ class EpisodeStore:
     #: (n_slots,) int, which of these times is that of the episode in a slot
     written: np.ndarray
 
-    def __init__(self, n_tasks: int, episodes_per_task: int, episode_length: int, row_dim: int, in_order: bool = True) -> None:
-        self.in_order = in_order
+    def __init__(self, n_tasks: int, episodes_per_task: int, episode_length: int, row_dim: int) -> None:
         self.episodes_per_task = episodes_per_task
         self.episode_length = episode_length
         self.n_added = np.zeros(n_tasks, dtype=np.int64)
@@ -146,7 +144,6 @@ class EpisodeStore:
         return {
             **{name: th.tensor(array) for name, array in arrays.items()},
             "capacity": th.tensor(len(self._data)),
-            "in_order": th.tensor(self.in_order),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -160,11 +157,6 @@ class EpisodeStore:
                 f"The saved episodes have {arrays['slots'].shape[1]} slots a task of shape {arrays['data'].shape[1:]}, this "
                 f"buffer has {self.episodes_per_task} of {self._data.shape[1:]}: "
                 "use the settings that they were saved with, and the same time limit."
-            )
-        if arrays["in_order"] != self.in_order:
-            raise ValueError(
-                "Of the saved episodes and those of this model, one follows the order of time and the other does not: use the "
-                "settings that they were saved with."
             )
         self.n_added, self._slots = arrays["n_added"], arrays["slots"]
         self._n_slots = len(arrays["data"])

@@ -433,9 +433,7 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             return steps_ahead(store.index(), virtual, n_steps)
         ahead, n = np.empty((len(virtual), n_steps), dtype=np.int64), np.empty(len(virtual), dtype=np.int64)
         for of_this, episodes in ((~of_store, self.episodes), (of_store, store)):
-            # Of one step, that step as often as columns are left
-            reach = n_steps if episodes.in_order else 1
-            ahead[of_this], n[of_this] = steps_ahead(episodes.index(), virtual[of_this], reach)
+            ahead[of_this], n[of_this] = steps_ahead(episodes.index(), virtual[of_this], n_steps)
         return ahead, n
 
     def _label(

@@ -237,21 +237,16 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
         """
         return self.encoder.posterior(self.extend_posterior(self.encoder.empty(len(context.lengths)), context))
 
-    def values(self, obs: np.ndarray, z: th.Tensor, actions: np.ndarray | None = None) -> th.Tensor:
+    def values(self, obs: np.ndarray, z: th.Tensor) -> th.Tensor:
         """
         :param obs: (n, obs_dim)
         :param z: (n, k, latent_dim)
-        :param actions: (n, action_dim), scaled to [-1, 1], done before acting with z; by default z chooses them
         :return: (n, k), the smaller critic's value of acting with each z
         """
         n, k, _ = z.shape
         normal = self.normalize(th.as_tensor(obs, dtype=th.float32, device=self.device))
         obs_z = th.cat([normal.repeat_interleave(k, dim=0), z.reshape(n * k, -1)], dim=1)
-        if actions is None:
-            chosen = self._act(obs_z, deterministic=True)
-        else:
-            chosen = th.as_tensor(actions, dtype=th.float32, device=self.device).repeat_interleave(k, dim=0)
-        return self.critic(obs_z, chosen).amin(dim=0).reshape(n, k)
+        return self.critic(obs_z, self._act(obs_z, deterministic=True)).amin(dim=0).reshape(n, k)
 
     def _act(self, obs_z: th.Tensor, deterministic: bool) -> th.Tensor:
         mean, log_std = self._gaussian(obs_z)

@@ -20,10 +20,9 @@ from sb3_htr.htr.relabel import TrainingTaskRelabelling
 
 KINDS: list[dict[str, Any]] = [
     {"name": "HindsightForesight"},
-    {"name": "HindsightInference", "level": "episode"},
-    {"name": "HindsightInference", "level": "transition"},
+    {"name": "HindsightInference"},
 ]
-kinds = pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.get("level", kind["name"]))
+kinds = pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind["name"])
 
 
 class Oracle:
@@ -192,27 +191,6 @@ def test_inference_is_the_return_under_the_task() -> None:
     np.testing.assert_allclose(utilities, np.where(distance < 0.2, 1 - distance, 0).sum(axis=-1), atol=1e-5)
 
 
-def test_what_is_relabelled_step_by_step_makes_up_episodes_of_one_task() -> None:
-    buffer = relabelling(KINDS[2], n_episodes=30, buffer_size=80_000)
-    buffer.sample(4, meta_batch_size=4)
-    relabeller = buffer.relabeller
-    assert isinstance(relabeller, TrainingTaskRelabelling)
-    index = relabeller.episodes.index()
-    lengths = np.diff(index.episode_row)
-    assert lengths.max() <= 20 and lengths.sum() == buffer.size() == 60 * 20
-    assert len(index.tasks) > 40, "without a reward, all tasks are as probable"
-
-
-@pytest.mark.parametrize("kind", KINDS[1:], ids=["episode", "transition"])
-def test_returns_of_several_steps_are_of_steps_that_followed_each_other(kind: dict[str, Any]) -> None:
-    buffer = relabelling(kind, n_episodes=30, buffer_size=80_000)
-    data = buffer.sample(16, meta_batch_size=32, n_steps=3, gamma=0.9)
-    steps = np.rint(np.log(data.discounts.numpy()) / np.log(0.9))
-    way = np.abs(data.next_observations.numpy() - data.observations.numpy()).max(axis=1)
-    assert (way <= 0.1 * steps + 1e-5).all(), "a step leads 0.1 away at most"
-    assert set(steps) == ({1, 2, 3} if kind["level"] == "episode" else {1})
-
-
 def test_rows_are_drawn_from_all_that_was_relabelled_and_from_nothing_else() -> None:
     """Also to tasks that were not played yet."""
     buffer = relabelling(KINDS[1], n_episodes=5)
@@ -275,8 +253,6 @@ def test_reset_forgets(tiny_pearl: MakePEARL) -> None:
         ({"name": "HindsightForesight", "temperature": -1}, "temperature is -1, expected a number of at least 0"),
         ({"name": "HindsightForesight", "temperature": 0.0}, "temperature is 0, by which utilities cannot be divided"),
         ({"name": "HindsightForesight", "n_starts": 0}, "n_starts is 0, expected a whole number of at least 1"),
-        ({"name": "HindsightInference", "level": "task"}, 'level is \'task\', expected "episode" or "transition"'),
-        ({"name": "HindsightInference", "context_size": 0}, "context_size is 0, expected a whole number of at least 1"),
         ({"name": "HindsightInference", "n_starts": 3}, "'HindsightInference' has no setting 'n_starts'"),
     ],
 )
@@ -327,39 +303,3 @@ def test_foresight_is_from_the_same_starts_for_all_episodes() -> None:
     buffer.relabeller.policy = Judge(lambda obs, actions: obs[:, 0])
     for _ in range(5):
         assert np.ptp(buffer.relabeller.utilities(rows, np.full(4, 20))) < 1e-6
-
-
-def test_transitions_are_judged_by_what_was_done_in_them() -> None:
-    relabeller = HindsightInference(level="transition")
-    buffer = make_buffer(n_envs=1, relabel_probability=1.0, relabeller=relabeller, buffer_size=16_000)
-    rows = rows_of(buffer, 2)
-    assert isinstance(buffer.relabeller, HindsightInference)
-    buffer.relabeller.policy = Judge(lambda obs, actions: obs[:, 0] if actions is None else actions[:, 0])
-    utilities = buffer.relabeller.utilities(rows, np.full(2, 20))
-    np.testing.assert_allclose(utilities, np.tile(rows[:, [2]], (1, 80)))
-
-
-def test_z_of_a_task_is_of_what_was_relabelled_to_it_last() -> None:
-    relabeller: Any = HindsightInference(level="transition")
-    buffer, rng = (
-        make_buffer(n_envs=1, relabel_probability=1.0, relabeller=relabeller, buffer_size=16_000),
-        np.random.default_rng(0),
-    )
-    relabeller, seen = buffer.relabeller, list[Context]()
-
-    class Watched:
-        device = th.device("cpu")
-
-        def infer(self, context: Context) -> tuple[th.Tensor, th.Tensor]:
-            seen.append(context)
-            return th.zeros(len(context.lengths), 1), th.ones(len(context.lengths), 1)
-
-        def values(self, obs: np.ndarray, z: th.Tensor, actions: Any = None) -> th.Tensor:
-            return th.zeros(z.shape[:2])
-
-    relabeller.policy = Watched()
-    for _ in range(2):
-        add_episode(buffer, [0], 20, rng)
-        buffer.sample(4, meta_batch_size=4)
-        relabeller.episodes.rows[:, buffer.transitions.reward] = 7.0
-    assert not (seen[0].rewards == 7).any() and (seen[1].rewards == 7).any()

@@ -25,7 +25,7 @@ class AdaptingPolicy(Protocol):
         """Mean and variance (n_tasks, latent_dim) of the posteriors over z."""
         ...
 
-    def values(self, obs: np.ndarray, z: th.Tensor, actions: np.ndarray | None = None) -> th.Tensor:
+    def values(self, obs: np.ndarray, z: th.Tensor) -> th.Tensor:
         """Values (n, k) of acting with z (n, k, latent_dim) in observations (n, obs_dim), after ``actions`` if given."""
         ...
 

@@ -21,8 +21,6 @@ class HindsightBuffers(Relabeller):
     #: With the hindsight buffers in place of tasks
     episodes: EpisodeStore
     keeps_experience = True
-    #: Whether the transitions of an episode in there followed each other
-    in_order = True
 
     def bind(self, buffer: "MultiTaskReplayBuffer") -> None:
         super().bind(buffer)
@@ -34,7 +32,7 @@ class HindsightBuffers(Relabeller):
         """
         own = self.buffer.episodes
         width = self.buffer.transitions.width
-        self.episodes = EpisodeStore(n, own.episodes_per_task, own.episode_length, width, self.in_order)
+        self.episodes = EpisodeStore(n, own.episodes_per_task, own.episode_length, width)
 
     def draw_from(self, chosen: np.ndarray, tasks: np.ndarray) -> HindsightDraw:
         """

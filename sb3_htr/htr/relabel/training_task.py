@@ -7,7 +7,6 @@ import numpy as np
 import torch as th
 
 from sb3_htr.common.settings import check_numbers
-from sb3_htr.htr.groups import positions
 from sb3_htr.htr.relabel.base import HindsightDraw
 from sb3_htr.htr.relabel.hindsight_buffers import HindsightBuffers
 
@@ -71,15 +70,8 @@ class TrainingTaskRelabelling(HindsightBuffers):
         with th.no_grad():
             logits = self.utilities(rows, lengths) / self.temperature
         tasks = self._choose(logits)
-        if len(tasks) == len(lengths):
-            tasks, groups = np.repeat(tasks, lengths), tasks
-        else:
-            # Transitions of one task make up episodes of it, in the order in which they came
-            order = np.argsort(tasks, kind="stable")
-            rows, tasks = rows[order], tasks[order]
-            groups, lengths = _cut(np.bincount(tasks, minlength=self.buffer.n_tasks), self.episodes.episode_length)
-        self.buffer.write_rewards(rows, np.arange(len(rows)), self.buffer.task_family.train_tasks[tasks])
-        for task, episode in zip(groups, np.split(rows, np.cumsum(lengths)[:-1]), strict=True):
+        self.buffer.write_rewards(rows, np.arange(len(rows)), self.buffer.task_family.train_tasks[np.repeat(tasks, lengths)])
+        for task, episode in zip(tasks, np.split(rows, np.cumsum(lengths)[:-1]), strict=True):
             self.episodes.add(int(task), episode)
 
     def _choose(self, logits: np.ndarray) -> np.ndarray:
@@ -108,11 +100,3 @@ class TrainingTaskRelabelling(HindsightBuffers):
         super().load_state_dict(state)
         self._new = [episode.numpy().copy() for episode in state["new"].split(state["lengths"].tolist())]
         self._entropy = state["entropy"]
-
-
-def _cut(count: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of transitions of each task to parts of at most so many: the task of each part and its length, (n,) int each."""
-    n_parts = -(-count // size)
-    task = np.repeat(np.arange(len(count)), n_parts)
-    part = positions(n_parts)
-    return task, np.minimum(count[task] - part * size, size)
