@@ -1,6 +1,5 @@
 """Writes checkpoints from which a training goes on as if it had never stopped."""
 
-import re
 import shutil
 import time
 import warnings
@@ -60,27 +59,19 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def cut_monitor_files(run: Path, folder: Path, sizes: dict[str, int]) -> None:
+def cut_monitor_files(run: Path, sizes: dict[str, int]) -> None:
     """
-    Forget the episodes after a checkpoint. Those before it are kept in files that SB3 reads with the others.
+    Forget the episodes after a checkpoint.
 
     :param run: folder of a run, whose envs are not made yet
-    :param folder: the checkpoint
-    :param sizes: of the monitor files when it was made
+    :param sizes: of the monitor files when the checkpoint was made
     """
-    kept = f".until_{folder.name}.monitor.csv"
-    # Longest names first: a file that was cut at a later checkpoint begins with the episodes before this one, while the file
-    # that it was cut from may have been begun anew since
-    for path in sorted(run.glob("*.monitor.csv"), key=lambda path: len(path.name), reverse=True):
-        if path.name.endswith(kept) or (".until_" in path.name and path.name in sizes):
-            continue
-        name = path.name if path.name in sizes else re.sub(r"\.until_\d+_steps(?=\.monitor\.csv$)", "", path.name)
-        target = path.with_name(name.removesuffix(".monitor.csv") + kept)
-        # If it exists, this training has gone on from here before, and what is cut is already there
-        if name in sizes and not target.exists():
-            with atomic_path(target) as temporary:
-                temporary.write_bytes(path.read_bytes()[: sizes[name]])
-        path.unlink()
+    for path in run.glob("*.monitor.csv"):
+        if path.name in sizes:
+            with atomic_path(path) as temporary:
+                temporary.write_bytes(path.read_bytes()[: sizes[path.name]])
+        else:
+            path.unlink()
 
 
 class CheckpointCallback(BaseCallback):

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from multiprocessing.process import BaseProcess
 from multiprocessing.util import Finalize
+from pathlib import Path
 from typing import Any, cast
 
 import gymnasium as gym
@@ -215,7 +216,9 @@ def make_task_vec_env(
     monitored = TaskVecMonitor(venv, info_keywords=("is_success",) if tells_rewards(family) else ())
     if monitor_dir is not None:
         header: dict[str, Any] = {"t_start": monitored.t_start, "env_id": env_id}
-        monitored.results_writer = PatientResultsWriter(os.path.join(monitor_dir, "0"), header, monitored.info_keywords)
+        # A run that goes on has those of before, too
+        name = str(len([*Path(monitor_dir).glob("*.monitor.csv")]))
+        monitored.results_writer = PatientResultsWriter(os.path.join(monitor_dir, name), header, monitored.info_keywords)
     # Without one, SB3 would draw it from numpy's global generator
     if seed is not None:
         monitored.seed(seed)

@@ -118,13 +118,12 @@ def test_a_finished_run_without_its_checkpoints_says_so(
 
 def test_an_older_checkpoint_has_its_own_episodes(tmp_path: Path) -> None:
     """It went on from a later one, which was found damaged afterwards."""
-    path = tmp_path / "0.monitor.csv"
-    path.write_text("123456789")
-    cut_monitor_files(tmp_path, Path("480_steps"), {path.name: 6})
-    path.write_text("abcdefghi")
-    cut_monitor_files(tmp_path, Path("240_steps"), {path.name: 3})
-    (kept,) = tmp_path.iterdir()
-    assert (kept.name, kept.read_text()) == ("0.until_240_steps.monitor.csv", "123")
+    first, second = (tmp_path / f"{i}.monitor.csv" for i in range(2))
+    first.write_text("123456789")
+    cut_monitor_files(tmp_path, {first.name: 6})
+    second.write_text("abcdefghi")
+    cut_monitor_files(tmp_path, {first.name: 3})
+    assert [*tmp_path.iterdir()] == [first] and first.read_text() == "123"
 
 
 def test_a_run_whose_model_could_not_be_written_is_not_finished(unbroken: Path, tmp_path: Path) -> None:

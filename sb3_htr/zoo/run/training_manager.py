@@ -109,7 +109,7 @@ class TrainingManager(MetaExperimentManager):
                 with training_goes_on(str(left), "removed"):
                     left.unlink()
             folder, self._checkpoint = load_latest(self.resumed)
-            cut_monitor_files(self.resumed, folder, self._checkpoint["monitor_files"])
+            cut_monitor_files(self.resumed, self._checkpoint["monitor_files"])
             print(f"Going on from {folder}")
         self.params_path = f"{self.save_path}/{self.env_name}"
         super().create_log_folder()
