@@ -21,7 +21,6 @@ from sb3_htr.zoo.plots.curves import Curve, plot_curves
 from sb3_htr.zoo.plots.latent import plot_latent_space
 from sb3_htr.zoo.run.agents import TrainedAgent, runs_with_models
 from sb3_htr.zoo.run.record import RECORD
-from sb3_htr.zoo.run.time_to_learned import time_to_learned
 from sb3_htr.zoo.run.train_arguments import training_facts
 
 EXAMPLE = """  sb3-htr plot --env SparsePointRobot-v0                  an agent that comes with the package
@@ -196,27 +195,6 @@ def learning_curve(label: str, agents: Sequence[TrainedAgent]) -> Curve | None:
     return Curve(steps / 1000, returns, successes, agents[0].method)
 
 
-def print_time_to_learned(groups: dict[str, list[TrainedAgent]]) -> None:
-    """
-    :param groups: label and runs of each curve: one line for each of them, with the median over runs
-    """
-    for label, agents in groups.items():
-        folders = [agent.folder for agent in agents if agent.folder is not None and (agent.folder / EVALUATIONS).exists()]
-        ends = [load_arrays(folder / EVALUATIONS, ("timesteps",))["timesteps"].max() for folder in folders]
-        # Of a run that stopped earlier than the others, the last return is no end
-        whole = [folder for folder, end in zip(folders, ends, strict=True) if end == max(ends)]
-        times = [time for folder in whole if (time := time_to_learned(folder)) is not None]
-        if times:
-            learnt = [time for time in times if np.isfinite(time[0])]
-            runs = f" ({len(learnt)} of {len(times)} runs learnt; their median)" if len(times) > 1 else ""
-            if learnt:
-                steps, seconds = np.median(learnt, axis=0)
-                clock = "" if np.isnan(seconds) else f", {seconds:,.0f} seconds with evaluations"
-                print(f"{label}: 95 % of the way to its last return after {steps:,.0f} env steps{clock}{runs}")
-            else:
-                print(f"{label}: nothing learnt, the last evaluation is the lowest of each run")
-
-
 def main(argv: Sequence[str]) -> None:
     """The command, with its arguments."""
     description = "Pictures of one or several runs: learning curves, return per adaptation episode, paths, latent space."
@@ -244,7 +222,6 @@ def main(argv: Sequence[str]) -> None:
             about = f"{env_id}, validation tasks, {about_explorers(names)}"
             x_label, y_label = "thousand env steps of meta-training", "return of the last adaptation episode"
             plot_curves(learning, new("learning_curves"), about, x_label, y_label)
-            print_time_to_learned(groups)
         else:
             print("No learning curves: there is no evaluations.npz of a training.")
     if set(args.only) != {"learning"}:
