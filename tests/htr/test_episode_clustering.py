@@ -116,25 +116,6 @@ def test_memory_grows_with_the_number_of_hindsight_buffers() -> None:
     assert fine.stats()["replay/hindsight_megabytes"] > coarse.stats()["replay/hindsight_megabytes"]
 
 
-def test_a_task_space_can_bring_its_own_discretiser() -> None:
-    _, by_quadrant = filled(discretiser=lambda tasks: np.sign(tasks).astype(np.float32) * np.float32(0.1))
-    assert by_quadrant.n_hindsight_buffers <= 9
-
-
-def test_a_discretiser_of_another_dtype_goes_on_with_the_buffers_that_there_are() -> None:
-    def rounded(tasks: np.ndarray) -> np.ndarray:
-        return np.round(tasks.astype(np.float64) / 0.1) * 0.1
-
-    buffer, relabeller = filled(discretiser=rounded)
-    resumed, its_relabeller = filled(0, discretiser=rounded)
-    resumed.load_state_dict(buffer.state_dict())
-    for each in (buffer, resumed):
-        rng = np.random.default_rng(1)
-        for _ in range(20):
-            add_episode(each, [1, 2], 20, rng)
-    assert relabeller.n_hindsight_buffers == its_relabeller.n_hindsight_buffers > 1
-
-
 def test_hindsight_buffers_of_another_grid_are_refused() -> None:
     saved = filled(cell_size=0.1)[0].state_dict()
     buffer, relabeller = filled(0, cell_size=0.15)
@@ -180,12 +161,6 @@ def test_tasks_may_have_one_width_or_one_for_each_dimension() -> None:
     cells = [filled(cell_size=size)[1]._tasks for size in (0.1, [0.1], [0.1, 0.1])]
     np.testing.assert_array_equal(cells[0], cells[1])
     np.testing.assert_array_equal(cells[0], cells[2])
-
-
-@pytest.mark.parametrize("discretise", [lambda tasks: tasks.round(1)[:1], lambda tasks: tasks[:, 0].round(1)])
-def test_a_discretiser_that_leaves_tasks_out_is_refused(discretise: Any) -> None:
-    with pytest.raises(ValueError, match=r"discretiser returned shape \(.*\) for tasks of shape \(.*, 2\), expected the same"):
-        filled(1, discretiser=discretise)
 
 
 def test_cells_that_the_start_does_not_solve_are_preferred() -> None:

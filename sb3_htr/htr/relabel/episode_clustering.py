@@ -1,6 +1,6 @@
 """Episode Clustering (EC): relabelling when the data comes in."""
 
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch as th
@@ -15,40 +15,6 @@ if TYPE_CHECKING:
     from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 
 
-class Discretiser(Protocol):
-    """Maps tasks to representatives; tasks with one representative share a hindsight buffer."""
-
-    def __call__(self, tasks: np.ndarray) -> np.ndarray:
-        """(n, task_dim) tasks to their (n, task_dim) representatives, float32."""
-        ...
-
-
-class GridDiscretiser:
-    """
-    Rounds tasks to a grid.
-
-    :param cell_size: width of a cell in each dimension; at most the radius of a goal, so that an episode that reached a goal
-        has reached the middle of its cell too
-    :raises ValueError: if a width is not positive
-    """
-
-    def __init__(self, cell_size: float | list[float]) -> None:
-        try:
-            self.cell_size = np.asarray(cell_size, dtype=np.float32)
-        except (TypeError, ValueError):
-            raise ValueError(f"cell_size is {cell_size!r}, expected positive widths.") from None
-        if not ((self.cell_size > 0) & np.isfinite(self.cell_size)).all() or self.cell_size.size == 0:
-            raise ValueError(f"cell_size is {self.cell_size.tolist()}, expected positive widths.")
-
-    def __call__(self, tasks: np.ndarray) -> np.ndarray:
-        """
-        :param tasks: (n, task_dim)
-        :return: (n, task_dim) float32, middles of their cells
-        """
-        # adding 0 turns -0 into 0, the same cell with other bytes
-        return (np.round(tasks / self.cell_size) * self.cell_size + 0).astype(np.float32)
-
-
 class EpisodeClustering(HindsightBuffers):
     """
     Relabels each finished episode at once (HTR paper, B.3 and Algorithm 2), and keeps hindsight buffers of its own.
@@ -60,9 +26,8 @@ class EpisodeClustering(HindsightBuffers):
     Hindsight buffers need memory: it grows with their number, see ``replay/n_hindsight_buffers`` and
     ``replay/hindsight_megabytes`` in the logs.
 
-    :param cell_size: grid of the task space, see :class:`GridDiscretiser`. Our choice for the Point Robot: 0.1, half the goal
-        radius
-    :param discretiser: in place of a grid
+    :param cell_size: width of the cells of a grid of the task space, one for all dimensions, or one for each; tasks of a cell
+        share a hindsight buffer. Our choice for the Point Robot: 0.1, half the goal radius
     :param exploratory_fraction: share of the episodes of a hindsight buffer that are exploratory, i.e. were not chosen for
         having solved its task, in [0, 1). Real buffers hold many such; B.3 found the balance to matter and gives no value, 0.3
         is our choice
@@ -76,7 +41,6 @@ class EpisodeClustering(HindsightBuffers):
     def __init__(
         self,
         cell_size: float | list[float] = 0.1,
-        discretiser: Discretiser | None = None,
         exploratory_fraction: float = 0.3,
         hindsight_task_strategy: HindsightTaskStrategy | str = "even",
         prefer_unsolved: bool = True,
@@ -85,9 +49,12 @@ class EpisodeClustering(HindsightBuffers):
         if isinstance(fraction, bool) or not (isinstance(fraction, int | float) and 0 <= fraction < 1):
             raise ValueError(f"exploratory_fraction is {exploratory_fraction!r}, expected a number from 0 to below 1.")
         check_flags(prefer_unsolved=prefer_unsolved)
-        if not (discretiser is None or callable(discretiser)):
-            raise ValueError(f"discretiser is {discretiser!r}, expected a function of tasks, or None for a grid.")
-        self.discretiser = GridDiscretiser(cell_size) if discretiser is None else discretiser
+        try:
+            self.cell_size = np.asarray(cell_size, dtype=np.float32)
+        except (TypeError, ValueError):
+            raise ValueError(f"cell_size is {cell_size!r}, expected positive widths.") from None
+        if not ((self.cell_size > 0) & np.isfinite(self.cell_size)).all() or self.cell_size.size == 0:
+            raise ValueError(f"cell_size is {self.cell_size.tolist()}, expected positive widths.")
         self.exploratory_fraction = fraction
         self.hindsight_task_strategy = HindsightTaskStrategy.of(hindsight_task_strategy)
         self.prefer_unsolved = prefer_unsolved
@@ -95,11 +62,15 @@ class EpisodeClustering(HindsightBuffers):
     def bind(self, buffer: "MultiTaskReplayBuffer") -> None:
         super().bind(buffer)
         task_dim = buffer.task_family.train_tasks.shape[1]
-        if isinstance(self.discretiser, GridDiscretiser) and self.discretiser.cell_size.shape not in ((), (1,), (task_dim,)):
+        if self.cell_size.shape not in ((), (1,), (task_dim,)):
             raise ValueError(
-                f"cell_size has {self.discretiser.cell_size.size} widths, expected one, or {task_dim}, one for each dimension "
-                "of a task."
+                f"cell_size has {self.cell_size.size} widths, expected one, or {task_dim}, one for each dimension of a task."
             )
+
+    def _cells(self, tasks: np.ndarray) -> np.ndarray:
+        """(n, task_dim), the middles of their cells."""
+        # adding 0 turns -0 into 0, the same cell with other bytes
+        return (np.round(tasks / self.cell_size) * self.cell_size + 0).astype(np.float32)
 
     def reset(self) -> None:
         self.make_buffers(0)
@@ -112,10 +83,10 @@ class EpisodeClustering(HindsightBuffers):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         tasks = state["tasks"].numpy().copy()
         # Those of another grid would stay, and be drawn beside the cells of this one
-        if isinstance(self.discretiser, GridDiscretiser) and len(tasks) and (self.discretiser(tasks) != tasks).any():
+        if len(tasks) and (self._cells(tasks) != tasks).any():
             raise ValueError(
                 f"The hindsight buffers that were saved are of another grid than that of cell_size "
-                f"{self.discretiser.cell_size.tolist()}: make the model with the cell_size that they were saved with."
+                f"{self.cell_size.tolist()}: make the model with the cell_size that they were saved with."
             )
         super().load_state_dict(state)
         self._tasks = list(tasks)
@@ -127,12 +98,7 @@ class EpisodeClustering(HindsightBuffers):
         steps = strategy.steps(np.full(strategy.n_candidates, len(episode)), rng)
         traj = buffer.transitions.trajectory(episode)
         tasks = buffer.task_family.hindsight_task(traj, steps)
-        representatives = np.asarray(self.discretiser(tasks), dtype=np.float32)
-        if representatives.shape != tasks.shape:
-            raise ValueError(
-                f"discretiser returned shape {representatives.shape} for tasks of shape {tasks.shape}, expected the same: one "
-                "representative for each task."
-            )
+        representatives = self._cells(tasks)
         count = np.array([[1 + self._n_episodes_of(representative) for representative in representatives]])
         is_solved = None
         if self.prefer_unsolved:
