@@ -182,7 +182,10 @@ class MetaEvalCallback(EvalCallback):
 
     def _write_results(self) -> None:
         # Everything so far, so a file that could not be written is made up for by the next one
-        write_evaluations(Path(f"{self.log_path}.npz"), self.evaluations_timesteps, self.returns, self.successes)
+        returns, successes = np.stack(self.returns), np.stack(self.successes)
+        with atomic_path(f"{self.log_path}.npz") as path:
+            arrays = {"results": returns[:, :, -1], "returns": returns, "successes": successes}
+            np.savez_compressed(path, timesteps=self.evaluations_timesteps, **arrays)
 
     def _write_best(self, new: bool = False) -> None:
         with atomic_path(self._best_model) as temporary:
@@ -208,23 +211,6 @@ class MetaEvalCallback(EvalCallback):
                 f"Eval num_timesteps={self.num_timesteps}: return of adaptation episode 1: {returns[:, 0].mean():.2f}, "
                 f"of episode {returns.shape[1]}: {self.last_mean_reward:.2f}, success {successes[:, -1].mean():.0%}"
             )
-
-
-def write_evaluations(path: Path, timesteps: list[int], returns: list[np.ndarray], successes: list[np.ndarray]) -> None:
-    """
-    :param path: of ``evaluations.npz``, which is replaced
-    :param timesteps: env steps before each evaluation
-    :param returns: of each evaluation, (n_tasks, n_episodes)
-    :param successes: the same, bool
-    """
-    with atomic_path(path) as temporary:
-        np.savez_compressed(
-            temporary,
-            timesteps=timesteps,
-            results=np.stack(returns)[:, :, -1],
-            returns=np.stack(returns),
-            successes=np.stack(successes),
-        )
 
 
 def _share_an_env(one: VecEnv, other: VecEnv | None) -> bool:

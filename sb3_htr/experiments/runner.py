@@ -11,10 +11,9 @@ from filelock import Timeout
 
 import htr_envs  # noqa: F401 registers the envs
 from htr_envs.goal_env import find_hidden
-from sb3_htr.adaptation.callbacks import write_evaluations
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.atomic import atomic_path
-from sb3_htr.common.checkpoint import DamagedCheckpoint, checkpoints, read_checkpoint
+from sb3_htr.common.checkpoint import checkpoints
 from sb3_htr.common.digest import digest_of_code
 from sb3_htr.common.errors import reason
 from sb3_htr.common.settings import name_of
@@ -119,7 +118,6 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
         if trained is None:
             raise KeyboardInterrupt
     run, model = trained
-    _restore(run)
     advice = f"Its run has to be trained again: remove {folder}."
     try:
         evaluations = load_arrays(run / "evaluations.npz", ("timesteps", "results", "successes"), advice)
@@ -148,22 +146,6 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
         "machine": machines(record),
         **evaluate(cell, model, record["hyperparams"].get("explorer"), kept),
     }
-
-
-def _restore(run: Path) -> None:
-    """Write its log anew, of the last checkpoint, which has a checksum: a file may be spoilt, as by a full disk."""
-    try:
-        states = [of["state"] for of in read_checkpoint(checkpoints(run)[0])["callbacks"]]
-    except (IndexError, DamagedCheckpoint):  # it may have been removed
-        return
-    # Callbacks of one's own have states of any kind
-    for state in [state for state in states if isinstance(state, dict)]:
-        if state.keys() == {"keys", "text"}:
-            with atomic_path(run / "progress.csv") as path:
-                path.write_bytes(state["text"].encode())
-        if {"timesteps", "returns", "successes"} <= state.keys() and state["returns"]:
-            returns, successes = ([part.numpy() for part in state[key]] for key in ("returns", "successes"))
-            write_evaluations(run / "evaluations.npz", state["timesteps"], returns, successes)
 
 
 def find_finished(cell: Cell, folder: Path) -> tuple[Path, Model] | None:

@@ -168,24 +168,13 @@ def test_a_killed_evaluation_goes_on_after_what_it_has(tmp_path: Path, monkeypat
     assert not list(tmp_path.rglob(FOLDER)), "what is in a result is kept no longer"
 
 
-def test_a_spoilt_log_is_that_of_the_last_checkpoint(tmp_path: Path) -> None:
-    """And named where there is none."""
+def test_a_spoilt_log_is_named(tmp_path: Path) -> None:
     (cell,) = Experiment("one", "", ENV_ID, 960, (TINY,), 1, 480, by(("prior",)), n_episodes=2).cells()
     assert run_cell(cell, tmp_path)
-    result = cell.result(tmp_path)
-    whole = dict(np.load(result))
     run, _ = find_finished(cell, cell.run_folder(tmp_path)) or pytest.fail("there is one")
     progress, evaluations = run / "progress.csv", run / "evaluations.npz"
     text = progress.read_text()
-    for spoilt in ("", text.splitlines()[0] + "\n", text[: len(text) // 2]):
-        progress.write_text(spoilt)
-        evaluations.unlink()
-        result.unlink()
-        assert run_cell(cell, tmp_path)
-        again = dict(np.load(result))
-        assert all(np.array_equal(again[key], whole[key], equal_nan=whole[key].dtype.kind == "f") for key in whole)
-    shutil.rmtree(run / "checkpoints")
-    result.unlink()
+    cell.result(tmp_path).unlink()
     for spoilt in ("", text.splitlines()[0] + "\n", text[: text.index("\n") + 9]):
         progress.write_text(spoilt)
         with pytest.raises(ValueError, match=rf"{progress} is missing or damaged\. Its run has to be trained again: remove"):

@@ -129,7 +129,7 @@ class ProgressCallback(BaseCallback):
         """
         :return: the file, and what writes it, if a full disk has kept some of it from being written
         """
-        return {str(self.path): self._output.save} if self._output is not None and not self._output.is_whole else {}
+        return {str(self.path): self._output.save} if self._output is not None else {}
 
     def _on_training_end(self) -> None:
         assert self._output is not None
