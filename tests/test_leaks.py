@@ -6,7 +6,6 @@ import os
 from multiprocessing import get_context
 from pathlib import Path
 
-import numpy as np
 import torch as th
 
 import htr_envs  # noqa: F401 registers the envs, in a process of its own too
@@ -49,8 +48,8 @@ def test_memory_is_flat_once_the_buffers_are_full() -> None:
 
 
 def test_the_number_of_hindsight_buffers_is_all_that_grows_in_ec(tiny_pearl: MakePEARL) -> None:
-    """Their number is bounded by the discretiser, and each has the capacity of a real one."""
-    relabeller = EpisodeClustering(discretiser=lambda tasks: np.sign(tasks).astype(np.float32) * np.float32(0.1))
+    """Their number is bounded by the grid, and each has the capacity of a real one."""
+    relabeller = EpisodeClustering(cell_size=1.5)
     model = tiny_pearl(buffer_size=1600, replay_buffer_kwargs={"relabeller": relabeller}).learn(80 * 40)
     assert model.replay_buffer is not None
     clustering = model.replay_buffer.relabeller

@@ -183,9 +183,9 @@ class MetaEvalCallback(EvalCallback):
     def _write_results(self) -> None:
         # Everything so far, so a file that could not be written is made up for by the next one
         returns, successes = np.stack(self.returns), np.stack(self.successes)
+        steps = self.evaluations_timesteps
         with atomic_path(f"{self.log_path}.npz") as path:
-            arrays = {"results": returns[:, :, -1], "returns": returns, "successes": successes}
-            np.savez_compressed(path, timesteps=self.evaluations_timesteps, **arrays)
+            np.savez_compressed(path, timesteps=steps, results=returns[:, :, -1], returns=returns, successes=successes)
 
     def _write_best(self, new: bool = False) -> None:
         with atomic_path(self._best_model) as temporary:

@@ -94,12 +94,6 @@ def episodes_to_first_success(raw: Raw, evaluation: str) -> np.ndarray:
     return first_success(raw[f"successes_{evaluation}"])
 
 
-def loss_of_stability(raw: Raw, evaluation: str) -> np.ndarray:
-    """(1, 1), how far the worst of the last three evaluations on validation tasks is below the best of all."""
-    means = raw["curve"].mean(axis=1)
-    return np.atleast_2d(means.max() - means[-3:].min())
-
-
 def env_steps_to_solved(raw: Raw, evaluation: str) -> np.ndarray:
     """(1, 1), env steps of the first evaluation with enough validation tasks solved; of one more than were made if never."""
     return _when_solved(raw, raw["timesteps"])
@@ -125,13 +119,12 @@ _ALL = (
     last_episode_return,
     success_rate,
     episodes_to_first_success,
-    loss_of_stability,
     env_steps_to_solved,
     seconds_to_solved,
 )
 METRICS: dict[str, Callable[[Raw, str], np.ndarray]] = {metric.__name__: metric for metric in _ALL}
 # Of the evaluations within a training, which are by the explorer of the method
-OF_TRAINING = (loss_of_stability.__name__, env_steps_to_solved.__name__, seconds_to_solved.__name__)
+OF_TRAINING = (env_steps_to_solved.__name__, seconds_to_solved.__name__)
 # Of a run that was never solved, they are known to be larger than what they are counted as
 TIMES = (env_steps_to_solved.__name__, seconds_to_solved.__name__)
 

@@ -29,7 +29,6 @@ from sb3_htr.zoo.run.folder import SystemLock, run_number
 from sb3_htr.zoo.run.method import get_method, merged
 from sb3_htr.zoo.run.record import RECORD, read_record
 from sb3_htr.zoo.run.shipped import block_of
-from sb3_htr.zoo.run.time_to_learned import seconds_at
 from sb3_htr.zoo.run.train_arguments import training_facts
 from sb3_htr.zoo.run.trust import import_packages, plain_settings
 
@@ -130,6 +129,8 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
     if not len(progress):
         raise ValueError(f"{run / 'progress.csv'} is missing or damaged. {advice}")
     columns = progress.dtype.names or ()
+    steps, seconds = (progress[f"time/{key}"] for key in ("total_timesteps", "time_elapsed"))
+    timed = ~np.isnan(steps + seconds)
     record = read_record(run / RECORD)
     kept = EvaluationCache(run, agent_at(run, "last").path, cell.facts(), code)
     return {
@@ -137,7 +138,8 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
         "timesteps": evaluations["timesteps"],
         "curve": evaluations["results"],
         "solved": evaluations["successes"][..., -1],
-        "elapsed_s": seconds_at(run / "progress.csv", evaluations["timesteps"]),
+        # Between the rollouts that were logged around an evaluation. What was lost with a killed process does not count
+        "elapsed_s": np.interp(evaluations["timesteps"], steps[timed], seconds[timed]),
         "cell": cell.facts(),
         "hyperparams": json.dumps(record["hyperparams"], sort_keys=True),
         # Of the code as it was when the training began, and as it is in this process

@@ -89,7 +89,7 @@ def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monk
         assert {key.split("/")[0] for key in raw.files} == {cell.name for cell in own}
         assert all((raw[f"{cell.name}/returns_{cell.evaluations[0].name}"] == cell.seed).all() for cell in own)
     summary = json.loads((folder / "summary.json").read_text())
-    value = {"last_episode_return": 2.0, "success_rate": 1.0, "episodes_to_first_success": 3.0, "loss_of_stability": 1.0}
+    value = {"last_episode_return": 2.0, "success_rate": 1.0, "episodes_to_first_success": 3.0}
     value |= {"env_steps_to_solved": 3000.0, "seconds_to_solved": 3.0}
     variants = {(cell.variant, str(cell.env_kwargs)): cell for cell in cells}
     for row in summary["rows"]:
@@ -102,7 +102,7 @@ def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monk
     # An agent without explorers is evaluated once in each place
     n_tests = sum(len(cell.evaluations) for cell in variants.values())
     # What is of the training is of one explorer
-    assert len(summary["rows"]) == n_tests * 3 + len(variants) * 3
+    assert len(summary["rows"]) == n_tests * 3 + len(variants) * 2
     of_training = [row for row in summary["rows"] if row["metric"] == "env_steps_to_solved"]
     for row in of_training:
         own = hyperparams_of(variants[row["variant"], str(row["env_kwargs"])]).get("explorer", "own")
@@ -274,7 +274,6 @@ def test_metrics() -> None:
         "last_episode_return": [[2, 5]],
         "success_rate": [[1, 0]],
         "episodes_to_first_success": [[2, 4]],
-        "loss_of_stability": [[4]],
         "env_steps_to_solved": [[300]],
         "seconds_to_solved": [[22.5]],
     }

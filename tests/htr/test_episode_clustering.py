@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from helpers import MakePEARL
 from helpers.experience import FAMILY, add_episode, assert_same, make_buffer
 from sb3_htr.htr import EpisodeClustering, MultiTaskReplayBuffer
-from sb3_htr.htr import EpisodeClustering as EC
 
 
 def filled(
@@ -29,9 +28,9 @@ def filled(
 @given(st.lists(st.tuples(st.floats(-5, 5), st.floats(-5, 5)), min_size=1), st.floats(0.01, 2))
 def test_grid_maps_tasks_to_the_middle_of_their_cell(tasks: list[tuple[float, float]], cell_size: float) -> None:
     points = np.array(tasks, dtype=np.float32)
-    middles = EC(cell_size)._cells(points)
+    middles = EpisodeClustering(cell_size).cells(points)
     assert middles.dtype == np.float32 and (np.abs(middles - points) <= cell_size / 2 + 1e-3).all()
-    np.testing.assert_allclose(EC(cell_size)._cells(middles), middles, atol=1e-4)
+    np.testing.assert_allclose(EpisodeClustering(cell_size).cells(middles), middles, atol=1e-4)
 
 
 def test_store_and_buffer_know_nothing_of_its_hindsight_tasks() -> None:

@@ -193,7 +193,7 @@ def test_relabellers_given_to_two_models_are_not_shared(tiny_pearl: MakePEARL, r
     assert ours.buffer is buffers[0] and theirs.buffer is buffers[1] and ours.policy is models[0].policy
     if isinstance(ours, EpisodeClustering) and isinstance(theirs, EpisodeClustering):
         assert ours.n_hindsight_buffers > 0 == theirs.n_hindsight_buffers
-        assert vars(ours.discretiser) == vars(relabeller.discretiser) == vars(theirs.discretiser)
+        assert ours.cell_size == relabeller.cell_size == theirs.cell_size
     alone = tiny_pearl(seed=2).replay_buffer
     assert alone is not None and buffers[1].size() == alone.size() == 0
 
@@ -373,7 +373,7 @@ def test_what_is_unrewarded_is_what_the_rewards_of_the_batch_say(n_steps: int) -
 @pytest.mark.parametrize("k", [0.0, 1.0])
 def test_contexts_are_of_the_latest_episodes_and_rl_batches_of_all(k: float) -> None:
     """Of the task, or of the hindsight buffer, which is the only one here."""
-    one = {"name": "EpisodeClustering", "discretiser": np.zeros_like, "exploratory_fraction": 0.0}
+    one = {"name": "EpisodeClustering", "cell_size": 100.0, "exploratory_fraction": 0.0}
     settings: dict[str, Any] = {"relabel_probability": k, "relabeller": one, "context_episodes": 2}
     buffer, rng = make_buffer(n_envs=1, buffer_size=16_000, **settings), np.random.default_rng(0)
     for _ in range(6):

@@ -1,7 +1,6 @@
 """``sb3-htr train`` and ``sb3-htr evaluate``, as a user would call them."""
 
 import json
-import platform
 import re
 import subprocess
 import sys
@@ -28,7 +27,6 @@ from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.commands.evaluate import table
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback
-from sb3_htr.zoo.run.malloc import keep_freed_memory
 from sb3_htr.zoo.run.manager import MetaExperimentManager
 from sb3_htr.zoo.run.method import DEFAULT, get_method
 from sb3_htr.zoo.run.record import RECORD, read_record

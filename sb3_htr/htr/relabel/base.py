@@ -26,7 +26,7 @@ class AdaptingPolicy(Protocol):
         ...
 
     def values(self, obs: np.ndarray, z: th.Tensor) -> th.Tensor:
-        """Values (n, k) of acting with z (n, k, latent_dim) in observations (n, obs_dim), after ``actions`` if given."""
+        """Values (n, k) of acting with z (n, k, latent_dim) in observations (n, obs_dim)."""
         ...
 
 

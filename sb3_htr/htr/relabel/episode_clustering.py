@@ -67,8 +67,11 @@ class EpisodeClustering(HindsightBuffers):
                 f"cell_size has {self.cell_size.size} widths, expected one, or {task_dim}, one for each dimension of a task."
             )
 
-    def _cells(self, tasks: np.ndarray) -> np.ndarray:
-        """(n, task_dim), the middles of their cells."""
+    def cells(self, tasks: np.ndarray) -> np.ndarray:
+        """
+        :param tasks: (n, task_dim)
+        :return: (n, task_dim) float32, the middles of their cells
+        """
         # adding 0 turns -0 into 0, the same cell with other bytes
         return (np.round(tasks / self.cell_size) * self.cell_size + 0).astype(np.float32)
 
@@ -83,7 +86,7 @@ class EpisodeClustering(HindsightBuffers):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         tasks = state["tasks"].numpy().copy()
         # Those of another grid would stay, and be drawn beside the cells of this one
-        if len(tasks) and (self._cells(tasks) != tasks).any():
+        if len(tasks) and (self.cells(tasks) != tasks).any():
             raise ValueError(
                 f"The hindsight buffers that were saved are of another grid than that of cell_size "
                 f"{self.cell_size.tolist()}: make the model with the cell_size that they were saved with."
@@ -98,7 +101,7 @@ class EpisodeClustering(HindsightBuffers):
         steps = strategy.steps(np.full(strategy.n_candidates, len(episode)), rng)
         traj = buffer.transitions.trajectory(episode)
         tasks = buffer.task_family.hindsight_task(traj, steps)
-        representatives = self._cells(tasks)
+        representatives = self.cells(tasks)
         count = np.array([[1 + self._n_episodes_of(representative) for representative in representatives]])
         is_solved = None
         if self.prefer_unsolved:
