@@ -10,7 +10,7 @@ from sb3_htr.common.markdown import markdown_table
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
-DOCUMENTS = [ROOT / "docs" / name for name in ("performance.md", "scaling.md", "rivals.md")]
+DOCUMENTS = [ROOT / name for name in ("docs/performance.md", "docs/rivals.md", "benchmarks/README.md")]
 
 
 def table(content: dict[str, Any]) -> str:
