@@ -12,9 +12,9 @@ from sb3_htr.adaptation.task_bank import MAX_HINDSIGHT_TASKS, MAX_TRAIN_TASKS, T
 from sb3_htr.common.linear import left_to_torch
 from sb3_htr.common.segments import segment_sum
 
-# Quantiles of what unrewarded and rewarded steps return beside what the model says is task-free; rewards are told from the
-# model's errors by the middle between the two
-UNREWARDED, REWARDED = 0.999, 0.001
+# Shares of unrewarded and rewarded steps that the threshold between the two may miss, the smallest that will do: the model
+# that says what is task-free errs where that is rare and large, as a penalty for a fall is
+MISSED = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 0.5)
 # Steps that are looked at under all tasks at once, to bound memory
 CHUNK = 2**14
 # Before anything is known, above 0 and below what a success is worth where it is worth 1
@@ -165,10 +165,9 @@ class LatentKnowledge(nn.Module):
         task_free = model.task_free(obs, action, next_obs)
         self.task_free_value.copy_(task_free.mean() / max(1 - gamma, 1e-3))
         beside = reward - task_free
-        unrewarded = beside[~success].quantile(UNREWARDED) if (~success).any() else th.zeros(())
         # Of long episodes, the steps that the bank keeps may miss all that were rewarded
         if success.any():
-            self.threshold.copy_((unrewarded + beside[success].quantile(REWARDED)) / 2)
+            self.threshold.copy_(_between(beside[~success], beside[success]))
         return Particles(z, earned / n_rewarded, share * returns[:, None], _log_prior(z, overlap, is_train), is_train)
 
     def set_particles(self, particles: Particles) -> None:
@@ -185,6 +184,16 @@ class LatentKnowledge(nn.Module):
         """
         n = int(self.n_particles)
         return Particles(self.z[:n], self.gain[:n, :n], self.returns[:n, :n], self.log_prior[:n], self.is_train[:n])
+
+
+def _between(unrewarded: th.Tensor, rewarded: th.Tensor) -> th.Tensor:
+    """The middle between what most unrewarded steps and most rewarded ones return, which is () for (n,) and (m,)."""
+    missed, kept = (th.tensor(shares, device=rewarded.device) for shares in (MISSED, [1 - share for share in MISSED]))
+    low = unrewarded.quantile(kept) if len(unrewarded) else th.zeros_like(missed)
+    high = rewarded.quantile(missed)
+    # The last one where nothing tells them apart
+    is_between = (low < high) | (missed == missed[-1])
+    return ((low + high) / 2)[is_between][0]
 
 
 def _log_prior(z: th.Tensor, overlap: th.Tensor, is_train: th.Tensor) -> th.Tensor:

@@ -302,6 +302,23 @@ def test_what_is_known_of_solved_tasks_is_that_of_the_docstrings(tiny_pearl: Mak
     assert model.knowledge.threshold.item() == pytest.approx(0.5, abs=0.02), "between nothing and the smallest reward"
 
 
+@pytest.mark.parametrize("stop", [-10.0, 10.0])
+def test_what_is_task_free_and_hard_to_predict_makes_no_successes(stop: float, tiny_pearl: MakePEARL) -> None:
+    """As a rare penalty for a safety stop, also in a step that solved a hindsight task."""
+    model = tiny_pearl()
+    know_tasks(model, 3)
+    columns = Transitions(model.observation_space, model.action_space)
+    rows = np.zeros((800, columns.width), dtype=np.float32)
+    success = np.arange(800) % 2 == 0
+    rows[:, columns.reward] = success + stop * (np.arange(800) % 200 < 2)
+    ones = np.ones(1, dtype=np.float32)
+    solved = SolvedTasks(rows, np.array([800]), success, ones, ones > 0)
+    bank: Any = type("Bank", (), {"transitions": columns, "solved": lambda self: solved})()
+    with th.no_grad():
+        model.knowledge._solved(model.policy, bank, gamma=0.9)
+    assert 0.2 < model.knowledge.threshold < 0.8
+
+
 def test_what_the_bank_keeps_of_a_long_episode_has_its_reward() -> None:
     """Which lies between two of the steps that would be kept."""
     env, family = gym.make(ENV_ID), PointRobotFamily(n_train_tasks=3)
