@@ -195,6 +195,15 @@ def test_a_dead_env_process_is_named_and_hangs_nothing(tiny_pearl: MakePEARL) ->
         tiny_pearl(env).learn(ROLLOUT)
 
 
+def test_an_env_of_this_process_that_loses_its_connection_says_so_itself(tiny_pearl: MakePEARL) -> None:
+    class Lost(gym.Wrapper[Any, Any, Any, Any]):
+        def step(self, action: Any) -> Any:
+            raise ConnectionResetError("the robot is gone")
+
+    with pytest.raises(ConnectionResetError, match="the robot is gone"):
+        tiny_pearl(Lost(gym.make(ENV_ID))).learn(ROLLOUT)
+
+
 class Fragile(gym.Wrapper[Any, Any, Any, Any]):
     n_steps = 0
 

@@ -140,12 +140,13 @@ def _returns_are_named() -> Iterator[None]:
     """An env's returns are unpacked and stored by SB3, whose errors do not say what was expected."""
     try:
         yield
-    except ValueError as error:
+    except (ValueError, TypeError) as error:
         # Where SB3 stores what the env returned; within the env, an error is the env's own
         last = traceback.extract_tb(error.__traceback__)[-1]
         wrong = NOT_STORED.get(last.name)
-        if last.filename != dummy_vec_env.__file__ or wrong is None:
+        is_info = "item assignment" in str(error)
+        if last.filename != dummy_vec_env.__file__ or wrong is None or not (is_info or isinstance(error, ValueError)):
             raise
-        if last.name == "step_wait" and "unpack" in str(error):
+        if last.name == "step_wait" and (is_info or "unpack" in str(error)):
             wrong = "an env's step must return observation, reward, terminated, truncated and info"
         raise ValueError(f"{error}: {wrong}") from error

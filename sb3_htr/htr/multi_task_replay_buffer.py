@@ -189,8 +189,8 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         :param reward: (n_envs,)
         :param done: (n_envs,)
         :param infos: one dict per env with ``task_id`` and ``task_free_reward``
-        :raises ValueError: NaN or infinite values, a task id that is no training task, a task that changed within an episode,
-            an episode longer than the time limit, another achieved task than the family tells
+        :raises ValueError: NaN or infinite values, actions that are not scaled, a task id that is no training task, a task
+            that changed within an episode, an episode longer than the time limit, another achieved task than the family tells
         """
         task = np.array([info.get("task_id", -1) for info in infos], dtype=np.int64)
         timeout = np.array([info.get("TimeLimit.truncated", False) for info in infos])
@@ -210,6 +210,11 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             raise ValueError(
                 f"An episode is longer than the env's time limit of {self.max_episode_steps} steps: the env does not end it, "
                 "or a callback stepped the envs of training, as one that evaluates in them does; give it envs of its own."
+            )
+        if (beyond := np.abs(action) > 1 + 1e-5).any():
+            raise ValueError(
+                f"An action of {np.asarray(action)[beyond].flat[0]:.3g} was to be stored, expected numbers from -1 to 1: "
+                "policy.scale_action makes those of an env so."
             )
         columns = self.transitions
         self._open[env, step, columns.observation] = np.reshape(obs, (self.n_envs, -1))

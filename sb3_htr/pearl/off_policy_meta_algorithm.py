@@ -11,7 +11,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, TrainFreq
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from stable_baselines3.sac import SAC
 
 from sb3_htr.adaptation.adaptation import Adaptation, Step
@@ -466,6 +466,8 @@ class OffPolicyMetaAlgorithm(MetaTest, ReplayFiles, CheckedFiles, SAC):
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from error
         except (EOFError, ConnectionError) as error:
+            if not isinstance(self.env and self.env.unwrapped, SubprocVecEnv):  # such as a robot's connection
+                raise
             raise RuntimeError(
                 f"{where}, the process of an env died: its own traceback is printed above. Envs in one process (vec_env "
                 "dummy) show it here."

@@ -1,5 +1,6 @@
 """Which z is acted with: the promises of the explorers."""
 
+import copy
 import itertools
 from pathlib import Path
 from typing import Any
@@ -57,6 +58,11 @@ def test_an_adaptation_goes_on_from_its_recorded_steps(explorer: str, tmp_path: 
     now = recorded[-1].next_observations
     np.testing.assert_array_equal(again.act(now), ours.act(now))
     np.testing.assert_array_equal(again.explorer.final_z(), ours.explorer.final_z())
+    kept = copy.deepcopy(again)
+    for each in recorded[:30]:
+        again.act(each.observations)
+        again.observe(each)
+    np.testing.assert_array_equal(kept.act(now), ours.act(now), "a copy is as it was")
 
 
 def test_where_nothing_happened_yet_there_is_nothing_to_infer(tiny_pearl: MakePEARL) -> None:

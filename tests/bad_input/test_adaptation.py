@@ -68,6 +68,13 @@ def test_a_robot_that_returns_something_else(returned: Any, message: str, tiny_p
         tiny_pearl().adapt(robot)
 
 
+def test_a_robot_without_infos(tiny_pearl: MakePEARL) -> None:
+    robot = Robot(20)
+    robot.step = lambda action: (np.zeros(2, dtype=np.float32), 0.0, False, False, None)  # type: ignore[method-assign]
+    with pytest.raises(ValueError, match="an env's step must return observation, reward, terminated, truncated and info"):
+        tiny_pearl().adapt(robot)
+
+
 @pytest.mark.parametrize(
     "reset",
     [

@@ -52,6 +52,8 @@ def test_only_complete_episodes_can_be_sampled() -> None:
     buffer.episode_listeners.append(lambda task, episode: heard.append((task, len(episode))))
     step = np.zeros((1, 2), dtype=np.float32)
     buffer.add(step, step, step, np.zeros(1), np.zeros(1, bool), [{"task_id": 0, "task_free_reward": 0.0}])
+    with pytest.raises(ValueError, match=r"An action of 50 was to be stored, expected numbers from -1 to 1"):
+        buffer.add(step, step, step + 50, np.zeros(1), np.zeros(1, bool), [{"task_id": 0, "task_free_reward": 0.0}])
     assert buffer.size() == 0 and not heard
     with pytest.raises(ValueError, match="no complete episode"):
         buffer.sample(4)
