@@ -83,11 +83,13 @@ def test_add_and_sample(data: st.DataObject) -> None:
     done = np.full(2, True)
     for _ in range(data.draw(st.integers(0, 60))):
         tasks[done] = rng.integers(0, 5, done.sum())
-        obs, action = rng.normal(size=(2, 2, 2)).astype(np.float32)
+        obs, action = rng.normal(size=(2, 2)).astype(np.float32), rng.uniform(-1, 1, (2, 2)).astype(np.float32)
         done = rng.random(2) < data.draw(st.sampled_from([0.02, 0.3, 1.0]))
-        bad = data.draw(st.sampled_from([None] * 20 + ["nan", "task"]))
+        bad = data.draw(st.sampled_from([None] * 20 + ["nan", "task", "action"]))
         if bad == "nan":
             obs[0, 0] = np.nan
+        if bad == "action":
+            action[0, 0] = 1.1
         infos = [{"task_id": 99 if bad == "task" else int(task), "task_free_reward": 0.0} for task in tasks]
         before = buffer.size()
         try:
