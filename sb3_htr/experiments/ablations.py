@@ -44,7 +44,7 @@ class NoValue(Belief):
     """Before the first reward, what an episode is expected to earn alone: not how soon, nor whether the policy gets there."""
 
     def most_promising(self, envs: np.ndarray, obs: np.ndarray) -> th.Tensor:
-        return self.particles.z[(self.weights(envs) @ self.particles.gain.T).argmax(dim=1)]
+        return (self.weights(envs) @ self.particles.gain.T).argmax(dim=1)
 
 
 @dataclass
@@ -60,6 +60,9 @@ class NoInference(Belief):
     """What the reward model says of rewards is ignored: the belief stays as it was beforehand."""
 
     def update_belief(self, step: Step) -> None:
+        pass
+
+    def rule_out(self, envs: np.ndarray) -> None:
         pass
 
 

@@ -5,6 +5,7 @@ import itertools
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -37,6 +38,23 @@ def test_the_given_explorer_is_settings_and_each_adaptation_has_its_own(tiny_pea
     play(other, [[5, 5], [1, 0]])
     np.testing.assert_array_equal(play(ours, [[0, 0], [0, 5], [0, 4], [3, 4]]), alone)
     assert ours.explorer is not model.explorer is not other.explorer and vars(model.explorer) == before
+
+
+class Stopped(gym.Wrapper[Any, Any, Any, Any]):
+    """Has a zone that ends episodes, unlike those of training."""
+
+    def step(self, action: Any) -> Any:
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        return obs, reward, terminated or bool(np.hypot(*(obs - 0.5)) < 0.25), truncated, info
+
+
+def test_a_stop_on_the_way_does_not_end_all_searches(tmp_path: Path) -> None:
+    """Where it is on the way to the task that promises most."""
+    model = agent_for(ENV_ID, str(tmp_path)).load()
+    assert isinstance(model, PEARL)
+    for task in ([-1.0, 0.05], [0.0, 1.0], [1.0, 0.05]):
+        returns = model.adapt(Stopped(gym.make(ENV_ID)), n_episodes=12, task=task, explorer="belief").returns
+        assert returns[0] == 0 < returns[-1], "the stop is met, and then the task"
 
 
 @pytest.mark.parametrize("explorer", ["prior", "aggregate", "belief", "learned-prior"])

@@ -31,7 +31,8 @@ class Belief(ParticleExplorer):
     returned half as much. The others have a single z, the one that promises the largest return: of a particle, under the same
     belief; of the best episode so far, what it returned. The encoder's posterior mean, given a new best episode, is tried
     once. Where an episode begins elsewhere each time, a z that was good may be a bad one: an episode that is not rewarded and
-    whose value, as it goes on, is not what it was at the start, searches on to its end.
+    whose value, as it goes on, is not what it was at the start, searches on to its end. Two searches in a row that end without
+    a reward on the way to the same task tell against it and those like it.
 
     :param margin: a particle must promise so many times what the best episode returned, to be tried in its place; 1 or more
     :param kept: in [0, 1], when an episode with one z keeps its word: of what was found, the share that it must return to end
@@ -67,6 +68,8 @@ class Belief(ParticleExplorer):
         # Particles that had an episode, and the one that is acted with, -1 for none
         self._tried = np.zeros((n_envs, len(self.particles.z)), dtype=bool)
         self._particle = np.full(n_envs, -1)
+        # The one that a search headed for last, in this episode and in the one before, -1 for none
+        self._aim, self._aim_before = np.full(n_envs, -1), np.full(n_envs, -1)
         # The encoder's word on a new best episode
         self._proposal = np.zeros_like(self.z)
         self._has_proposal = np.zeros(n_envs, dtype=bool)
@@ -103,7 +106,8 @@ class Belief(ParticleExplorer):
         if len(envs) == 0:
             return
         with th.no_grad():
-            chosen = self.most_promising(envs, obs).cpu().numpy()
+            self._aim[envs] = self.most_promising(envs, obs).cpu().numpy()
+            chosen = self.particles.z[self._aim[envs]].cpu().numpy()
         self._turned[envs] |= ~self._at_start[envs] & (chosen != self.z[envs]).any(axis=1)
         self.z[envs] = chosen
 
@@ -111,7 +115,7 @@ class Belief(ParticleExplorer):
         """
         :param envs: (k,) int, where the task is searched for
         :param obs: (n_envs, obs_dim), what is acted on
-        :return: (k, latent_dim), z of the particles that earn most, and soonest
+        :return: (k,) int, particles that earn most, and soonest
         """
         n_compared = min(N_COMPARED, len(self.particles.z))
         gain, index = (self.weights(envs) @ self.particles.gain.T).topk(n_compared, dim=1)
@@ -120,7 +124,7 @@ class Belief(ParticleExplorer):
         # Critics that learn from a dense proxy have another level, of which nothing tells: then it is the worst of them
         level = th.where(values.amax(dim=1, keepdim=True) > level, level, values.amin(dim=1, keepdim=True))
         promise = gain * (values - level).clamp(min=0)
-        return z[th.arange(len(envs)), promise.argmax(dim=1)]
+        return index[th.arange(len(envs)), promise.argmax(dim=1)]
 
     def _exploit(self, envs: np.ndarray, obs: np.ndarray) -> None:
         """What returns most."""
@@ -176,8 +180,23 @@ class Belief(ParticleExplorer):
         repeatable = envs[~self._turned[envs] & (returns > self._best_z_return[envs] + ROUNDING)]
         self._best_z[repeatable], self._best_z_return[repeatable] = self.z[repeatable], episode_return[repeatable]
         self.propose(better)
+        self.rule_out(envs)
         self._turned[envs], self._gave_up[envs], self._at_start[envs] = False, False, True
         self._n_steps[envs], self._particle[envs] = 0, -1
+
+    def rule_out(self, envs: np.ndarray) -> None:
+        """
+        What ended two searches on the way to one task, such as an obstacle or a safety stop, would end all that follow. So
+        count it as evidence: they would have met the task, and those like it.
+
+        :param envs: (k,) int, whose episodes end
+        """
+        aim = np.where(self.adaptation.episode_return[envs] > 0, -1, self._aim[envs])
+        again = (aim >= 0) & (aim == self._aim_before[envs])
+        gain = self.particles.gain[aim[again]]
+        met = (gain / gain.amax(dim=1, keepdim=True).clamp(min=1e-6)).clamp(self.doubt, 1 - self.doubt)
+        self.log_weights[envs[again]] += (1 - met).log()
+        self._aim_before[envs], self._aim[envs] = aim, -1
 
     def propose(self, envs: np.ndarray) -> None:
         """
