@@ -20,7 +20,7 @@ AWAY = (errno.ESTALE, errno.EIO, errno.ETIMEDOUT, errno.EHOSTDOWN)
 
 class SharedFolder:
     """
-    A :class:`sb3_htr.experiments.storage.Storage`.
+    What a driver asks, and a command, of a folder. What is said of a cell is as of the latest look, or newer.
 
     :param runs: folder of all experiments' runs
     """
@@ -41,7 +41,11 @@ class SharedFolder:
         self.runs.mkdir(parents=True, exist_ok=True)
 
     def look(self, cells: Sequence[Cell]) -> None:
-        """A listing is fresh where answers about single files may be remembered, as by NFS."""
+        """
+        A listing is fresh where answers about single files may be remembered, as by NFS.
+
+        :param cells: that will be asked about
+        """
         for folder in {cell.result(self.runs).parent for cell in cells}:
             with self._patient(folder):
                 self._listed[folder] = set(os.listdir(folder)) if folder.exists() else set()
@@ -92,12 +96,19 @@ class SharedFolder:
         return self._n_steps.get(cell.label, 0)
 
     def call(self, cell: Cell) -> tuple[Any, ...]:
-        """See :func:`sb3_htr.experiments.runner.run_cell`."""
+        """
+        :param cell: of an experiment
+        :return: what an executor is to call, a function and its arguments. It says whether there is a result; if not, another
+            process runs the cell
+        """
         return run_cell, cell, self.runs
 
     def fetch_results(self, cells: Sequence[Cell]) -> Path:
-        """They are there."""
+        """
+        :param cells: of experiments
+        :return: folder of this machine that has the results of those that are finished
+        """
         return self.runs
 
     def send_results(self, cells: Sequence[Cell]) -> None:
-        """They are there."""
+        """:param cells: of which that folder may have results that were not there, which a folder has at once"""

@@ -37,7 +37,7 @@ CLAIMS = ".claims"
 
 class ObjectStore:
     """
-    A :class:`sb3_htr.experiments.storage.Storage`.
+    The same as :class:`sb3_htr.experiments.storage.folder.SharedFolder`, of an object store.
 
     :param url: of fsspec
     :raises ValueError: if it cannot be opened here

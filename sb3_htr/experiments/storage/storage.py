@@ -6,7 +6,6 @@ from pathlib import Path
 from sb3_htr.experiments.storage.folder import SharedFolder
 from sb3_htr.experiments.storage.objects import ObjectStore
 
-# What a driver asks, and a command. What is said of a cell is as of the latest look, or newer
 Storage = SharedFolder | ObjectStore
 
 
