@@ -124,13 +124,13 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
         raise OSError(f"{run / 'evaluations.npz'} cannot be read ({reason(error)}). {advice}") from error
     try:
         progress = np.atleast_1d(np.genfromtxt(run / "progress.csv", delimiter=",", names=True, deletechars=""))
-    except (OSError, ValueError, IndexError):
-        progress = np.empty(0)
-    if not len(progress):
-        raise ValueError(f"{run / 'progress.csv'} is missing or damaged. {advice}")
+        steps, seconds = (progress[f"time/{key}"] for key in ("total_timesteps", "time_elapsed"))
+        timed = ~np.isnan(steps + seconds)
+        # Between the rollouts that were logged around an evaluation. What was lost with a killed process does not count
+        elapsed_s = np.interp(evaluations["timesteps"], steps[timed], seconds[timed])
+    except (OSError, ValueError, IndexError) as error:
+        raise ValueError(f"{run / 'progress.csv'} is missing or damaged. {advice}") from error
     columns = progress.dtype.names or ()
-    steps, seconds = (progress[f"time/{key}"] for key in ("total_timesteps", "time_elapsed"))
-    timed = ~np.isnan(steps + seconds)
     record = read_record(run / RECORD)
     kept = EvaluationCache(run, agent_at(run, "last").path, cell.facts(), code)
     return {
@@ -138,8 +138,7 @@ def _train_and_evaluate(cell: Cell, folder: Path) -> dict[str, Any]:
         "timesteps": evaluations["timesteps"],
         "curve": evaluations["results"],
         "solved": evaluations["successes"][..., -1],
-        # Between the rollouts that were logged around an evaluation. What was lost with a killed process does not count
-        "elapsed_s": np.interp(evaluations["timesteps"], steps[timed], seconds[timed]),
+        "elapsed_s": elapsed_s,
         "cell": cell.facts(),
         "hyperparams": json.dumps(record["hyperparams"], sort_keys=True),
         # Of the code as it was when the training began, and as it is in this process

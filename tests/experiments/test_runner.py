@@ -175,7 +175,7 @@ def test_a_spoilt_log_is_named(tmp_path: Path) -> None:
     progress, evaluations = run / "progress.csv", run / "evaluations.npz"
     text = progress.read_text()
     cell.result(tmp_path).unlink()
-    for spoilt in ("", text.splitlines()[0] + "\n", text[: text.index("\n") + 9]):
+    for spoilt in ("", text.splitlines()[0] + "\n", text[: text.index("\n") + 9], text.replace("time_elapsed", "time")):
         progress.write_text(spoilt)
         with pytest.raises(ValueError, match=rf"{progress} is missing or damaged\. Its run has to be trained again: remove"):
             run_cell(cell, tmp_path)
