@@ -167,7 +167,7 @@ def make_task_vec_env(
     :param env_id: a registered id; ``"module:id"`` imports the module first
     :param n_envs: number of envs stepped together
     :param seed: seed of the envs' own randomness
-    :param monitor_dir: folder for the CSV of episode returns, none by default
+    :param monitor_dir: folder for the CSV of episode returns, beside those that are there; none by default
     :param env_kwargs: arguments of the env
     :param wrapper: of each single env
     :param vec_env_class: of single envs; by default they are natively batched if they can be, else in this process

@@ -127,7 +127,7 @@ class ProgressCallback(BaseCallback):
 
     def to_write(self) -> dict[str, Callable[[], None]]:
         """
-        :return: the file, and what writes it, if a full disk has kept some of it from being written
+        :return: the file, and what writes all of it anew, whatever became of it meanwhile
         """
         return {str(self.path): self._output.save} if self._output is not None else {}
 
