@@ -13,7 +13,7 @@ from sb3_htr.common.linear import left_to_torch
 from sb3_htr.common.segments import segment_sum
 
 # Shares of unrewarded and rewarded steps that the threshold between the two may miss, the smallest that will do: the model
-# that says what is task-free errs where that is rare and large, as a penalty for a fall is
+# that says what is task-free errs where that is rare and large, as a penalty for a fall is. Our choice
 MISSED = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 0.5)
 # Steps that are looked at under all tasks at once, to bound memory
 CHUNK = 2**14

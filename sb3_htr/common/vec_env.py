@@ -5,6 +5,7 @@ import os
 import signal
 from collections.abc import Callable, Sequence
 from contextlib import closing
+from itertools import count
 from multiprocessing.process import BaseProcess
 from multiprocessing.util import Finalize
 from pathlib import Path
@@ -217,7 +218,7 @@ def make_task_vec_env(
     if monitor_dir is not None:
         header: dict[str, Any] = {"t_start": monitored.t_start, "env_id": env_id}
         # A run that goes on has those of before, too
-        name = str(len([*Path(monitor_dir).glob("*.monitor.csv")]))
+        name = next(name for name in map(str, count()) if not Path(monitor_dir, f"{name}.monitor.csv").exists())
         monitored.results_writer = PatientResultsWriter(os.path.join(monitor_dir, name), header, monitored.info_keywords)
     # Without one, SB3 would draw it from numpy's global generator
     if seed is not None:

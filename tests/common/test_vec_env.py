@@ -233,3 +233,14 @@ def test_a_batch_whose_observations_have_another_shape_is_refused(monkeypatch: p
     batch.reset(seed=0)
     with pytest.raises(ValueError, match=r"expected arrays of the shapes \(\(2, 2\), \(2,\), \(2,\)\), got \(\(2,\), "):
         batch.step(batch.action_space.sample())
+
+
+def test_a_folder_of_episodes_keeps_those_of_before(tmp_path: Path) -> None:
+    """Also where one file of several was removed."""
+    for _ in range(3):
+        make_task_vec_env(ENV_ID, 1, monitor_dir=str(tmp_path)).close()
+    (tmp_path / "0.monitor.csv").unlink()
+    before = (tmp_path / "1.monitor.csv").read_text()
+    make_task_vec_env(ENV_ID, 1, monitor_dir=str(tmp_path)).close()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f"{i}.monitor.csv" for i in range(3)]
+    assert (tmp_path / "1.monitor.csv").read_text() == before
