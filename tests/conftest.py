@@ -1,6 +1,7 @@
 """Fixtures, where tests run, and how hard hypothesis looks."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,14 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     """Whether it can run here."""
     if item.get_closest_marker("gpu") is not None and not th.cuda.is_available():
         pytest.skip("needs a GPU, and -m gpu")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def logs_of_sb3(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Each training would leave an empty folder among the temporary files of the machine."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SB3_LOGDIR", str(tmp_path_factory.mktemp("logs_of_sb3")))
+        yield
 
 
 @pytest.fixture
