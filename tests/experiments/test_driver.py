@@ -12,6 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from multiprocessing import get_context
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -242,12 +243,18 @@ def _sleep(begun: Path) -> None:
 
 
 def test_a_node_on_which_all_fails_at_once_does_not_take_the_queue(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(executors, "FAST", 0.5)
-    start = time.monotonic()
-    assert executors._call(divmod, 7, 2) == (3, 1) and time.monotonic() - start < 0.4
-    with pytest.raises(ZeroDivisionError):
-        executors._call(divmod, 7, 0)
-    assert time.monotonic() - start >= 0.5
+    now, slept = [100.0], list[float]()
+
+    def fail_after(seconds: float) -> None:
+        now[0] += seconds
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(executors, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=slept.append))
+    assert executors._call(divmod, 7, 2) == (3, 1) and not slept
+    for seconds in (15.0, 70.0):
+        with pytest.raises(ZeroDivisionError):
+            executors._call(fail_after, seconds)
+    assert slept == [executors.FAST - 15, 0], "a minute in all"
 
 
 def test_one_that_is_interrupted_alone_ends_no_other(trains: Any, tmp_path: Path) -> None:

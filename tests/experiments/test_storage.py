@@ -15,6 +15,7 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -50,6 +51,7 @@ TINY_RUN = Variant("htr-ser", "tiny", OF_CELL, {"n_test_tasks": 4})
 NODE = """
 import pickle, sys
 from pathlib import Path
+from types import SimpleNamespace
 import helpers.bucket
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.storage import objects
@@ -59,6 +61,10 @@ training = Cell.training
 Cell.training = lambda cell, folder: [*training(cell, folder), "--save-freq", "1"]
 objects.run_on_copy(pickle.loads(Path(sys.argv[2]).read_bytes()), sys.argv[1])
 """
+
+
+# Seconds
+VOID = 2.0
 
 
 @pytest.fixture
@@ -71,10 +77,18 @@ def url(tmp_path: Path) -> str:
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Looks are frequent, who is silent is soon taken for dead, and what fails is soon tried again."""
     monkeypatch.setattr(driver_module, "PERIOD", 0.02)
-    monkeypatch.setattr(claim_module, "VOID", 2.0)
+    monkeypatch.setattr(claim_module, "VOID", VOID)
     monkeypatch.setattr(objects, "RENEW", 0.05)
     monkeypatch.setattr(objects, "PATIENCE", (0.01, 0.01))
     monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 50)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """What a watch says, which goes on as the test makes it."""
+    now = [0.0]
+    monkeypatch.setattr(claim_module, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    return now
 
 
 @pytest.fixture
@@ -146,8 +160,7 @@ def test_of_several_that_claim_the_same_at_once_one_gets_it(kind: type[AtOnce], 
     assert sum(taken) == 1 and [claim.is_ours() for claim in claims] == taken
 
 
-def test_who_is_silent_loses_a_claim_and_who_is_done_leaves_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(claim_module, "VOID", 0.5)
+def test_who_is_silent_loses_a_claim_and_who_is_done_leaves_it(tmp_path: Path, clock: list[float]) -> None:
     files, folder, watch = Bucket(), str(tmp_path / "claims"), Watch()
     silent, other, third = (Claim(files, folder) for _ in range(3))
 
@@ -159,10 +172,10 @@ def test_who_is_silent_loses_a_claim_and_who_is_done_leaves_it(tmp_path: Path, m
 
     assert silent.take() and watch.is_alive(*newest()) and not other.take()
     for _ in range(4):
-        time.sleep(0.2)
+        clock[0] += 0.9 * VOID
         silent.renew()
         assert watch.is_alive(*newest()), "as long as it is renewed"
-    time.sleep(0.6)
+    clock[0] += 1.1 * VOID
     assert not watch.is_alive(*newest())
     void = content()
     silent.renew()
@@ -273,13 +286,17 @@ def test_several_drivers_share_the_cells_and_none_runs_twice(
     assert len(trained) == 7, "what is done is skipped"
 
 
-def test_a_node_at_work_is_not_taken_for_dead(url: str, trains: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(claim_module, "VOID", 1.5)
+def test_a_node_at_work_is_not_taken_for_dead(url: str, trains: Any, clock: list[float]) -> None:
     store, cell = ObjectStore(url), CELLS[0]
 
     def work(cell: Cell, folder: Path) -> None:
-        for _ in range(30):
-            time.sleep(0.1)
+        (path,) = store.files.find(f"{store.root}/{cell.experiment}/{cell.name}/.claims")
+        for _ in range(4):
+            before, deadline = store.files.cat_file(path), time.monotonic() + 60
+            while store.files.cat_file(path) == before:
+                assert time.monotonic() < deadline, "no sign of life"
+                time.sleep(0.01)
+            clock[0] += 0.9 * VOID
             store.look([cell])
             assert store.is_claimed(cell)
 
@@ -289,20 +306,19 @@ def test_a_node_at_work_is_not_taken_for_dead(url: str, trains: Any, monkeypatch
     assert store.is_finished(cell) and not store.is_claimed(cell) and len(trained) == 1
 
 
-def test_silence_counts_while_the_store_is_within_reach(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_silence_counts_while_the_store_is_within_reach(url: str, clock: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
     """Its owner may be out of reach, too, and alive."""
-    monkeypatch.setattr(claim_module, "VOID", 0.5)
     store, cell = ObjectStore(url), CELLS[0]
     assert Claim(store.files, f"{store.root}/{cell.run_folder(Path()).as_posix()}/.claims").take()
     store.look([cell])
     assert store.is_claimed(cell)
     with monkeypatch.context() as patch:
         failing(patch, "find", 99)
-        time.sleep(0.6)
+        clock[0] += 1.1 * VOID
         store.look([cell])
     store.look([cell])
     assert store.is_claimed(cell)
-    time.sleep(0.6)
+    clock[0] += 1.1 * VOID
     store.look([cell])
     assert not store.is_claimed(cell)
 
