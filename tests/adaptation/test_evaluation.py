@@ -94,12 +94,12 @@ def test_the_number_of_envs_does_not_matter(tiny_pearl: MakePEARL) -> None:
 def test_context_comes_from_the_adaptation_alone(tiny_pearl: MakePEARL) -> None:
     """garage took it from the replay buffer: whatever is stored there must change nothing."""
     model = tiny_pearl(explorer=PRIOR).learn(2 * ROLLOUT)
-    before = evaluate_adaptation(model, ENV_ID, n_episodes=4)
+    before = evaluate_adaptation(model, ENV_ID, "validation", n_episodes=4)
     assert model.replay_buffer is not None
     model.replay_buffer.episodes.rows[:] = 1e3
-    after = evaluate_adaptation(model, ENV_ID, n_episodes=4)
+    after = evaluate_adaptation(model, ENV_ID, "validation", n_episodes=4)
     model.replay_buffer = None
-    without = evaluate_adaptation(model, ENV_ID, n_episodes=4)
+    without = evaluate_adaptation(model, ENV_ID, "validation", n_episodes=4)
     for result in (after, without):
         for x, y in zip(before, result, strict=True):
             np.testing.assert_array_equal(x, y)
@@ -235,7 +235,6 @@ def test_adapt_keeps_one_task_when_the_env_has_none(tiny_pearl: MakePEARL) -> No
     [
         (lambda m: m.adapt(ENV_ID, n_episodes=0), "n_episodes is 0, expected a whole number of at least 1"),
         (lambda m: m.adapt(make_task_vec_env(ENV_ID, 2)), "the VecEnv has 2 envs"),
-        (lambda m: m.adapt(ENV_ID, task=80), "80"),
         (lambda m: m.adapt(ENV_ID), "Which task of SparsePointRobot-v0 the agent is for, nobody would know: pass task"),
         (lambda m: m.adapt(ENV_ID, task=0, explorer="x"), "explorer is 'x', expected one of"),
         (lambda m: m.adapt(ENV_ID, task=0, explorer={"name": "prior", "scale": 1}), "explorer 'prior' has no setting 'scale'"),

@@ -164,15 +164,9 @@ def test_damage_at_350_places_is_noticed_or_harmless(tmp_path: Path) -> None:
     assert noticed > 300
 
 
-def test_reading_a_checkpoint_runs_no_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    fuse = tmp_path / "exploded"
+def test_what_could_not_be_read_without_running_code_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"\['bomb'\] is a .*Bomb"):
-        write_checkpoint(tmp_path / "1_steps", {"bomb": Bomb(fuse)})
-    monkeypatch.setattr("sb3_htr.common.checkpoint.check_state", lambda *_: None)
-    write_checkpoint(tmp_path / "1_steps", {"bomb": Bomb(fuse)})
-    with pytest.raises(DamagedCheckpoint, match="is not what sb3-htr writes, and may run code"):
-        read_checkpoint(tmp_path / "1_steps")
-    assert not fuse.exists()
+        write_checkpoint(tmp_path / "1_steps", {"bomb": Bomb(tmp_path / "fuse")})
 
 
 def test_who_wrote_a_checkpoint_may_be_unknown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

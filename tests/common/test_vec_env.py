@@ -220,21 +220,6 @@ def test_envs_that_draw_are_stepped_one_by_one() -> None:
     assert not isinstance(env.unwrapped, BatchedTaskVecEnv) and picture is not None and picture.shape[-1] == 3
 
 
-def test_a_batch_whose_observations_have_another_shape_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each env would be judged by what the first one sees."""
-    batch = PointRobotVectorEnv(2)
-    move = batch._step_state
-
-    def flat(actions: np.ndarray) -> Any:
-        states, *others = move(actions)
-        return states[:, 0], *others
-
-    monkeypatch.setattr(batch, "_step_state", flat)
-    batch.reset(seed=0)
-    with pytest.raises(ValueError, match=r"expected arrays of the shapes \(\(2, 2\), \(2,\), \(2,\)\), got \(\(2,\), "):
-        batch.step(batch.action_space.sample())
-
-
 def test_a_folder_of_episodes_keeps_those_of_before(tmp_path: Path) -> None:
     """Also where one file of several was removed."""
     for _ in range(3):

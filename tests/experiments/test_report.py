@@ -266,12 +266,12 @@ def test_metrics() -> None:
         "elapsed_s": np.arange(1, 6) * 7.5,
         "curve": np.array([[1.0], [9], [8], [5], [7]]),
         "solved": np.array([[0], [0], [1], [0], [1]]),
-        "returns_a": np.arange(6.0).reshape(1, 2, 3),
+        "returns_a": np.array([[[0.0, 9, 2], [3, 4, 5]]]),
         "successes_a": np.array([[[False, True, True], [False, False, False]]]),
     }
     values = {name: metric(raw, "a").tolist() for name, metric in METRICS.items()}
     assert values == {
-        "last_episode_return": [[2, 5]],
+        "last_episode_return": [[2, 5]],  # not the best
         "success_rate": [[1, 0]],
         "episodes_to_first_success": [[2, 4]],
         "env_steps_to_solved": [[300]],
@@ -313,11 +313,6 @@ def test_a_slow_learner_needs_times_the_env_steps(tmp_path: Path, monkeypatch: p
         assert shown == {end: pytest.approx(factor, abs=1e-3) for end in ends}, "how much later or sooner it was is not known"
         assert (slowdown["n_unsolved"], slowdown["n_at_first"]) == (2 * (solved[-1] < 16), 2 * (solved[0] > 0))
         assert (slowdown["at_most"], slowdown["at_least"]) == ("low" not in ends, "high" not in ends)
-
-
-def test_the_last_episode_is_the_last_one_and_not_the_best_one() -> None:
-    raw = {"returns_a": np.array([[[0.0, 9, 2], [3, 4, 5]]])}
-    assert METRICS["last_episode_return"](raw, "a").tolist() == [[2, 5]]
 
 
 def test_a_final_model_adapts_to_the_test_tasks_once_with_each_seed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -134,11 +134,8 @@ def test_what_is_drawn_has_the_types_and_shapes_of_the_docstring(relabeller: str
     assert data.next_observations.shape == (24, 2) and data.dones.shape == (24,)
 
 
-def test_unrewarded_rows_are_those_without_a_reward_of_their_task() -> None:
+def test_a_cost_that_no_task_has_a_part_in_hides_no_missing_reward() -> None:
     buffer = filled(relabel_probability=0.5)
-    data = buffer.sample(16, meta_batch_size=200)
-    np.testing.assert_array_equal(data.unrewarded, [(r == 0).all() for r in by_task(data.rewards, data.lengths)])
-    # A cost that no task has a part in hides nothing
     columns = buffer.transitions
     buffer.episodes.rows[:, [columns.reward, columns.task_free_reward]] -= 0.25
     costly = buffer.sample(16, meta_batch_size=200)
@@ -269,22 +266,6 @@ def test_bad_steps(change: dict[str, float], message: str) -> None:
     info = {"task_id": values["task_id"], "task_free_reward": 0.0}
     with pytest.raises(ValueError, match=message):
         buffer.add(obs, next_obs, np.zeros((1, 2)), np.array([values["reward"]]), np.array([False]), [info])
-
-
-def test_a_task_that_changes_within_an_episode_and_an_episode_without_end() -> None:
-    buffer = make_buffer(n_envs=1)
-    step = np.zeros((1, 2), dtype=np.float32)
-
-    def add(task: int) -> None:
-        buffer.add(step, step, step, np.zeros(1), np.zeros(1, bool), [{"task_id": task, "task_free_reward": 0.0}])
-
-    add(1)
-    with pytest.raises(ValueError, match="changed from 1 to 2 within an episode"):
-        add(2)
-    for _ in range(19):
-        add(1)
-    with pytest.raises(ValueError, match="longer than the env's time limit of 20"):
-        add(1)
 
 
 @pytest.mark.parametrize(
