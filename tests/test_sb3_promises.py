@@ -11,7 +11,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.callbacks import (
     CallbackList,
     CheckpointCallback,
@@ -23,6 +22,7 @@ from stable_baselines3.sac.policies import Actor
 
 from helpers import ENV_ID, ROLLOUT, TINY, MakePEARL
 from helpers import parameters as all_parameters
+from helpers.envs import Rescaled
 from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.adaptation import MetaEvalCallback
 from sb3_htr.common.checkpoint import load_latest
@@ -159,18 +159,6 @@ def test_envs_can_be_replaced_by_equal_ones_only(tiny_pearl: MakePEARL) -> None:
         tiny_pearl().set_env(make_task_vec_env("SparseTargetSpeed-v0", 4))
     with pytest.raises(ValueError, match=r"The env has another task family: its goal_distance is 0\.5"):
         model.set_env(make_task_vec_env(ENV_ID, 4, env_kwargs={"goal_distance": 0.5}))
-
-
-class Rescaled(gym.ActionWrapper[Any, Any, Any]):
-    """The same robot with actions in other units."""
-
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        super().__init__(env)
-        self.action_space = spaces.Box(np.array([0.0, -30.0]), np.array([2.0, 50.0]), dtype=np.float64)
-
-    def action(self, action: Any) -> Any:
-        low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
-        return (2 * (action - low) / (high - low) - 1).astype(np.float32)
 
 
 def test_actions_of_any_bounds(tiny_pearl: MakePEARL) -> None:

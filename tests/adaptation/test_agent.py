@@ -14,22 +14,12 @@ from torch import nn
 
 from helpers import ENV_ID, MakePEARL, with_policy
 from helpers.bombs import bombs
+from helpers.envs import Rescaled
 from sb3_htr import AdaptedAgent
 from sb3_htr.adaptation import Step
 from sb3_htr.common.random_state import seeded_actions
 
 pytestmark = pytest.mark.filterwarnings("ignore:No reward was found")
-
-
-class Rescaled(gym.ActionWrapper[Any, Any, Any]):
-    """The same robot with actions in other units, which are float64."""
-
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        super().__init__(env)
-        self.action_space = gym.spaces.Box(np.array([0.0, -30.0]), np.array([2.0, 50.0]), dtype=np.float64)
-
-    def action(self, action: Any) -> Any:
-        return (action - np.array([1.0, 10.0])) / np.array([1.0, 40.0])
 
 
 @pytest.mark.parametrize(

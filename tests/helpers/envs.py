@@ -36,6 +36,24 @@ def wrapped(wrapper: Any, **kwargs: Any) -> DummyVecEnv:
     return DummyVecEnv([lambda: wrapper(gym.make(ENV_ID, **kwargs))] * 4)
 
 
+class Rescaled(gym.ActionWrapper[Any, Any, Any]):
+    """The same robot with actions in other units, which are float64."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.action_space = spaces.Box(np.array([0.0, -30.0]), np.array([2.0, 50.0]), dtype=np.float64)
+
+    def action(self, action: Any) -> Any:
+        return (action - np.array([1.0, 10.0])) / np.array([1.0, 40.0])
+
+
+class DropsOptions(gym.Wrapper[Any, Any, Any, Any]):
+    """A wrapper as people write them."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        return self.env.reset(seed=seed)
+
+
 class Robot(gym.Env[Any, Any]):
     """Has a body and rewards, and no tasks."""
 

@@ -28,6 +28,11 @@ from sb3_htr.zoo.run.callbacks import PatientCSV, ProgressCallback
 SETTINGS = ["--seed", "3", "--save-freq", "1", "--env-kwargs", "goal_distance:0.4", "n_validation_tasks:1"]
 
 
+def full(*_: Any, **__: Any) -> None:
+    """In the place of what writes."""
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
 def parameters(folder: Path) -> dict[str, th.Tensor]:
     return parameters_of(PEARL.load(run_folder(folder) / f"{ENV_ID}.zip"))
 
@@ -82,9 +87,6 @@ def test_what_had_no_room_at_the_end_is_said_and_comes_back(
     arguments = train_arguments(tmp_path, 480, *SETTINGS, "--save-replay-buffer", eval_freq=240)
     run = run_folder(tmp_path)
 
-    def full(*_: Any, **__: Any) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
     with monkeypatch.context() as patch, warnings.catch_warnings(record=True):
         patch.setattr(writer, full)
         with pytest.raises(
@@ -97,9 +99,6 @@ def test_what_had_no_room_at_the_end_is_said_and_comes_back(
 
 
 def test_what_no_checkpoint_has_is_written_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: Any) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
     monkeypatch.setattr(PEARL, "save_replay_buffer", full)
     with pytest.raises(OSError, match=r"replay_buffer\.pkl could not be written .* there is no checkpoint"):
         main(train_arguments(tmp_path, 480, "--save-freq", "-1", "--save-replay-buffer"))
@@ -119,9 +118,6 @@ def test_a_run_that_was_removed_is_told_of(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_a_disk_that_is_full_before_the_training_has_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: Any) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
     monkeypatch.setattr("sb3_htr.zoo.run.training_manager.write_record", full)
     with pytest.raises(OSError, match=rf"No space left on device: '{run_folder(tmp_path)}'"):
         main(train_arguments(tmp_path, 480))

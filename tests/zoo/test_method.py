@@ -111,18 +111,24 @@ def test_a_name_and_settings_of_what_it_names_are_joined() -> None:
     assert merged(joined, {"relabeller": "SingleEpisodeRelabelling"}) == {"relabeller": "SingleEpisodeRelabelling", "n": 1}
 
 
+def by_file(folder: Path, **settings: Any) -> list[str]:
+    """A training by a file of its own, which has these settings."""
+    block = {key: value for key, value in TINY.items() if key != "seed"}
+    block |= {"policy": "MlpPolicy", "n_timesteps": 240, "n_envs": 4, **settings}
+    (folder / "my.yml").write_text(yaml.safe_dump({ENV_ID: block}))
+    where = ["train", "--env", ENV_ID, "-f", str(folder), "-conf", str(folder / "my.yml")]
+    return [*where, "--eval-freq", "-1", "--verbose", "0"]
+
+
 def test_settings_of_file_method_and_command_line_are_joined_in_this_order(tmp_path: Path) -> None:
-    block: dict[str, Any] = {key: value for key, value in TINY.items() if key != "seed"}
-    block |= {"policy": "MlpPolicy", "n_timesteps": 240, "n_envs": 4, "explorer": {"name": "prior", "margin": 2.5}}
-    block["replay_buffer_kwargs"] = {
+    replay = {
         "relabeller": {"name": "SingleEpisodeRelabelling", "hindsight_task_strategy": "final"},
         "relabel_probability": 0.1,
         "context_episodes": 3,
     }
-    (tmp_path / "my.yml").write_text(yaml.safe_dump({ENV_ID: block}))
-    arguments = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(tmp_path / "my.yml"), "--eval-freq", "-1"]
+    arguments = by_file(tmp_path, explorer={"name": "prior", "margin": 2.5}, replay_buffer_kwargs=replay)
     given = ["replay_buffer_kwargs:{'relabeller':{'cell_size':0.3}}", "explorer:{'doubt':0.1}"]
-    assert main([*arguments, "--verbose", "0", "--method", "htr-ec", "-params", *given]) == 0
+    assert main([*arguments, "--method", "htr-ec", "-params", *given]) == 0
     run = run_folder(tmp_path, "htr-ec")
     buffer = {"relabel_probability": 0.8, "rl_reward_type": "sparse", "context_episodes": 3}
     relabeller = {"name": "EpisodeClustering", "hindsight_task_strategy": "final", "cell_size": 0.3}
@@ -233,30 +239,24 @@ def test_enjoy_takes_the_agent_of_the_method_that_is_asked_for(
 
 
 def test_a_method_may_stand_in_the_yaml_file_and_among_the_params(tmp_path: Path) -> None:
-    block: dict[str, Any] = {key: value for key, value in TINY.items() if key != "seed"}
-    block |= {"policy": "MlpPolicy", "n_timesteps": 240, "n_envs": 4, "method": "htr-ec-prior"}
-    (tmp_path / "my.yml").write_text(yaml.safe_dump({ENV_ID: block}))
-    arguments = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(tmp_path / "my.yml"), "--eval-freq", "-1"]
+    arguments = by_file(tmp_path, method="htr-ec-prior")
     in_params = ["-params", "method:'pearl-sparse'"]
     for more, expected in (
         ([], "htr-ec-prior"),
         (in_params, "pearl-sparse"),
         (["--method", "htr-ser", *in_params], "htr-ser"),
     ):
-        assert main([*arguments, "--verbose", "0", *more]) == 0
+        assert main([*arguments, *more]) == 0
         record = json.loads((run_folder(tmp_path, expected) / RECORD).read_text())
         assert record["method"] == expected and "method" not in record["hyperparams"]
 
 
 def test_what_a_method_replaces_of_a_file_is_said(tmp_path: Path) -> None:
-    block: dict[str, Any] = {key: value for key, value in TINY.items() if key != "seed"}
-    block |= {"policy": "MlpPolicy", "n_timesteps": 240, "n_envs": 4, "explorer": "prior", "train_explorer": "aggregate"}
-    block["replay_buffer_kwargs"] = {"relabeller": {"name": "EpisodeClustering"}, "relabel_probability": 0.3}
-    (tmp_path / "my.yml").write_text(yaml.safe_dump({ENV_ID: block}))
-    arguments = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(tmp_path / "my.yml"), "--eval-freq", "-1"]
+    replay = {"relabeller": {"name": "EpisodeClustering"}, "relabel_probability": 0.3}
+    arguments = by_file(tmp_path, explorer="prior", train_explorer="aggregate", replay_buffer_kwargs=replay)
     replaced = "explorer 'prior', relabeller 'EpisodeClustering', relabel_probability 0.3, which the method htr-ser replaces"
     with pytest.warns(UserWarning, match=replaced):
-        assert main([*arguments, "--verbose", "0"]) == 0
+        assert main(arguments) == 0
 
 
 @pytest.mark.parametrize(
@@ -278,22 +278,15 @@ def test_what_yaml_makes_of_a_slip(learning_rate: Any, n_timesteps: Any, more: s
 
 
 def test_keywords_that_are_left_empty_are_none(tmp_path: Path) -> None:
-    block: dict[str, Any] = {key: value for key, value in TINY.items() if key != "seed"}
-    block |= {"policy": "MlpPolicy", "n_timesteps": 240, "n_envs": 4, "replay_buffer_kwargs": None, "env_kwargs": None}
-    (tmp_path / "my.yml").write_text(yaml.safe_dump({ENV_ID: block}))
-    arguments = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(tmp_path / "my.yml"), "--eval-freq", "-1"]
+    arguments = by_file(tmp_path, replay_buffer_kwargs=None, env_kwargs=None)
     for number, more in enumerate(([], ["-params", "env_kwargs:None"]), start=1):
-        assert main([*arguments, "--verbose", "0", *more]) == 0
+        assert main([*arguments, *more]) == 0
         assert json.loads((run_folder(tmp_path, number=number) / RECORD).read_text())["env_kwargs"] == {}
 
 
 def test_keywords_may_be_python_where_the_file_is_trusted(tmp_path: Path) -> None:
-    block = {key: value for key, value in TINY.items() if key not in ("seed", "policy_kwargs")}
-    block |= {"policy": "MlpPolicy", "n_timesteps": 240, "n_envs": 4, "learning_rate": "lin_1e-3"}
-    block["policy_kwargs"] = "dict(net_arch=[16], encoder_arch=[16])"
-    (tmp_path / "my.yml").write_text(yaml.safe_dump({ENV_ID: block}))
-    arguments = ["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(tmp_path / "my.yml"), "--eval-freq", "-1"]
-    assert main([*arguments, "--verbose", "0", "--trust"]) == 0
+    python = "dict(net_arch=[16], encoder_arch=[16])"
+    assert main([*by_file(tmp_path, learning_rate="lin_1e-3", policy_kwargs=python), "--trust"]) == 0
     assert PEARL.load(run_folder(tmp_path) / f"{ENV_ID}.zip").policy_kwargs["net_arch"] == [16]
 
 
