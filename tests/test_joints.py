@@ -239,7 +239,7 @@ def test_an_explorer(tiny_pearl: MakePEARL, tmp_path: Path, monkeypatch: pytest.
     visited = np.unique(np.concatenate(seen), axis=0)
     assert visited.tolist() == [[-1, -1, -1], [-1, -1, 0], [-1, -1, 1]], "one of 27 points in each episode"
     seen.clear()
-    expected = evaluate_adaptation(model, ENV_ID, n_episodes=5)
+    expected = evaluate_adaptation(model, ENV_ID, "validation", n_episodes=5)
     assert set(np.concatenate(seen).ravel()) <= {-2.0, 0.0, 2.0} and len(np.unique(np.concatenate(seen), axis=0)) == 5
     agent = model.adapt(ENV_ID, n_episodes=2, task=np.zeros(2))
     np.testing.assert_array_equal(agent.z, [-2.0, -2.0, -2.0], err_msg="the start solves it, and the first z was best")
@@ -250,8 +250,8 @@ def test_an_explorer(tiny_pearl: MakePEARL, tmp_path: Path, monkeypatch: pytest.
     other, learnt = tiny_pearl(), dict[str, Any](model.get_parameters())
     other.set_parameters(learnt)
     for results in (
-        evaluate_adaptation(loaded, ENV_ID, n_episodes=5),
-        evaluate_adaptation(other, ENV_ID, None, 5, Lattice(2.0)),
+        evaluate_adaptation(loaded, ENV_ID, "validation", n_episodes=5),
+        evaluate_adaptation(other, ENV_ID, "validation", 5, Lattice(2.0)),
     ):
         for ours, theirs in zip(results, expected, strict=True):
             np.testing.assert_array_equal(ours, theirs)
@@ -265,7 +265,7 @@ def test_what_an_encoder_does_in_training_alone_is_not_done_at_meta_test(tiny_pe
     model.policy.set_training_mode(True)
     before = th.get_rng_state()
     explorer = {"name": "prior", "n_exploration_episodes": 1}
-    records = [evaluate_adaptation(model, ENV_ID, n_episodes=3, explorer=explorer) for _ in range(2)]
+    records = [evaluate_adaptation(model, ENV_ID, "validation", n_episodes=3, explorer=explorer) for _ in range(2)]
     np.testing.assert_array_equal(records[0], records[1])
     assert th.equal(before, th.get_rng_state())
 
@@ -302,10 +302,9 @@ def test_an_encoder(tiny_pearl: MakePEARL, tmp_path: Path, monkeypatch: pytest.M
     np.testing.assert_allclose(seen[-1], 7.0, atol=1e-4)
     monkeypatch.undo()
     model.save(tmp_path / "model")
-    for ours, theirs in zip(
-        *(evaluate_adaptation(m, ENV_ID, n_episodes=3) for m in (model, PEARL.load(tmp_path / "model"))), strict=True
-    ):
-        np.testing.assert_array_equal(ours, theirs)
+    loaded = PEARL.load(tmp_path / "model")
+    ours, theirs = (evaluate_adaptation(each, ENV_ID, "validation", n_episodes=3) for each in (model, loaded))
+    np.testing.assert_array_equal(ours, theirs)
 
 
 def test_what_a_recurrent_encoder_takes_in_later_is_taken_in_as_if_at_once(tiny_pearl: MakePEARL) -> None:

@@ -11,7 +11,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
-from helpers import ENV_ID, ROLLOUT, MakePEARL
+from helpers import ENV_ID, ROLLOUT, TINY, MakePEARL
 from helpers.envs import Robot, wrapped
 from htr_envs import PointRobotFamily
 from sb3_htr import PEARL, load_untrusted
@@ -44,26 +44,36 @@ CHANGED = [
 ]
 
 
+def near() -> Any:
+    return make_task_vec_env(ENV_ID, 4, env_kwargs=NEAR)
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where a model and its replay are."""
+    folder = tmp_path_factory.mktemp("saved")
+    model = PEARL("MlpPolicy", near(), **TINY).learn(ROLLOUT)
+    model.save(folder / "model")
+    model.save_replay_buffer(folder / "buffer")
+    return folder
+
+
 @pytest.mark.parametrize(("change", "message"), CHANGED)
 @pytest.mark.parametrize("how", ["set_env", "load and replay", "load"])
 def test_wrong_rewards_are_refused_whenever_they_come_in(
-    how: str, change: Callable[[], Any], message: str, tiny_pearl: MakePEARL, tmp_path: Path
+    how: str, change: Callable[[], Any], message: str, saved: Path
 ) -> None:
-    model = tiny_pearl(make_task_vec_env(ENV_ID, 4, env_kwargs=NEAR)).learn(ROLLOUT)
-    model.save(tmp_path / "model")
-    model.save_replay_buffer(tmp_path / "buffer")
     if how == "load" and "family" in message:
         # Nothing was collected, and so another family is a new beginning
-        loaded = PEARL.load(tmp_path / "model", env=change())
+        loaded = PEARL.load(saved / "model", env=change())
         assert loaded.replay_buffer is not None and vars(loaded.replay_buffer.task_family)["goal_distance"] == 0.5
         return
     with pytest.raises(ValueError, match=message):
+        model = PEARL.load(saved / "model", env=near() if how == "set_env" else change())
+        if how != "load":
+            model.load_replay_buffer(saved / "buffer")
         if how == "set_env":
             model.set_env(change())
-        else:
-            model = PEARL.load(tmp_path / "model", env=change())
-            if how == "load and replay":
-                model.load_replay_buffer(tmp_path / "buffer")
         model.learn(10 * ROLLOUT, reset_num_timesteps=False)
 
 
@@ -106,21 +116,17 @@ def test_families_are_compared_by_all_that_is_in_them() -> None:
 
 @pytest.mark.parametrize("how", ["set_env", "load_replay_buffer"])
 def test_rewards_of_which_no_attribute_tells_are_compared(
-    how: str, tiny_pearl: MakePEARL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    how: str, tiny_pearl: MakePEARL, saved: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def env() -> Any:
-        return make_task_vec_env(ENV_ID, 4, env_kwargs=NEAR)
-
-    model = tiny_pearl(env()).learn(ROLLOUT)
-    model.save_replay_buffer(tmp_path / "buffer")
-    tiny_pearl(env()).load_replay_buffer(tmp_path / "buffer")
+    model = tiny_pearl(near())
+    model.load_replay_buffer(saved / "buffer")
     own = PointRobotFamily.compute_reward
     monkeypatch.setattr(PointRobotFamily, "compute_reward", lambda *args, **kwargs: 2 * own(*args, **kwargs))
     with pytest.raises(ValueError, match=r"What was collected is of another task family .* its compute_reward gives"):
         if how == "set_env":
-            model.set_env(env())
+            model.set_env(near())
         else:
-            tiny_pearl(env()).load_replay_buffer(tmp_path / "buffer")
+            tiny_pearl(near()).load_replay_buffer(saved / "buffer")
 
 
 def test_an_env_that_is_refused_leaves_the_model_as_it_was(tiny_pearl: MakePEARL) -> None:

@@ -220,6 +220,7 @@ def test_the_command_repeats_an_experiment(
     )
     experiment = Experiment("tiny", "Two tiny runs.", ENV_ID, 9600, variants, 1, 4800, by(("belief",)), n_episodes=3)
     monkeypatch.setitem(grid.EXPERIMENTS, "tiny", experiment)
+    monkeypatch.setattr("sb3_htr.experiments.executors.Processes", lambda _: SerialExecutor())
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit):
         main(["experiment", "--help"])
@@ -320,7 +321,7 @@ def test_plain_settings_of_a_variant_reach_its_evaluation(tmp_path: Path) -> Non
         assert run_cell(cell, tmp_path)
         agent = agent_at(cell.run_folder(tmp_path), "last")
         both = [replace(agent, trusted=trust).load() for trust in (False, True)]
-        ours, theirs = (evaluate_adaptation(model, ENV_ID, n_episodes=1) for model in both)
+        ours, theirs = (evaluate_adaptation(model, ENV_ID, "validation", n_episodes=1) for model in both)
         np.testing.assert_array_equal(ours, theirs)
 
 

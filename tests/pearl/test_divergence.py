@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 import torch as th
 
-from helpers import ROLLOUT, MakePEARL
+from helpers import ROLLOUT, MakePEARL, with_policy
 from sb3_htr.common.divergence import DivergedError
 from sb3_htr.common.warn_once import WarnOnce
 from sb3_htr.pearl.divergence import check_posterior
@@ -44,6 +44,11 @@ def test_the_posterior_is_watched() -> None:
 
 
 def test_a_collapsed_posterior_is_warned_of_in_training(tiny_pearl: MakePEARL) -> None:
-    model = tiny_pearl(kl_coef=1000.0, learning_rate=0.01, gradient_steps=300)
+    """By an encoder whose rows say nothing, and which stays as it is."""
+    model = tiny_pearl(learning_rate=0.0, policy_kwargs=with_policy(encoder_class="PriorFactorEncoder"))
+    *_, last = model.encoder.factors.children()
+    with th.no_grad():
+        last.weight.zero_()
+        last.bias.copy_(th.tensor([0.0] * 3 + [-20.0] * 3))
     with pytest.warns(UserWarning, match="collapsed"):
-        model.learn(3 * ROLLOUT)
+        model.learn(ROLLOUT)

@@ -172,7 +172,7 @@ def test_an_untrusted_model_acts_as_the_one_that_was_saved(tiny_pearl: MakePEARL
     assert loaded.replay_buffer_kwargs == replay and vars(loaded.learning_rate) == vars(rate)
     assert loaded.explorer == Belief(margin=2.0) and loaded.train_explorer == Prior(2)
     assert load_untrusted(tmp_path / "model.zip", ENV_ID, explorer="prior").explorer == Prior()
-    for a, b in zip(*(evaluate_adaptation(m, ENV_ID, n_episodes=3) for m in (model, loaded)), strict=True):
+    for a, b in zip(*(evaluate_adaptation(m, ENV_ID, "validation", n_episodes=3) for m in (model, loaded)), strict=True):
         np.testing.assert_array_equal(a, b)
     tiny_pearl(ent_coef="auto_0.3", target_entropy=-1.5, matmul_precision="medium", cuda_graph=False).save(
         tmp_path / "words.zip"
@@ -424,7 +424,7 @@ def test_layers_of_actor_and_critics_may_differ(tiny_pearl: MakePEARL, tmp_path:
     model = tiny_pearl(policy_kwargs=with_policy(net_arch={"pi": [8], "qf": [9, 10]})).learn(2 * ROLLOUT)
     model.save(tmp_path / "model")
     loaded = load_untrusted(tmp_path / "model", ENV_ID)
-    for a, b in zip(*(evaluate_adaptation(m, ENV_ID, n_episodes=3) for m in (model, loaded)), strict=True):
+    for a, b in zip(*(evaluate_adaptation(m, ENV_ID, "validation", n_episodes=3) for m in (model, loaded)), strict=True):
         np.testing.assert_array_equal(a, b)
 
 

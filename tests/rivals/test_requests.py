@@ -24,7 +24,7 @@ from sb3_htr.rivals.sac_her import SACHER
 RIVALS = pytest.mark.parametrize("kind", [RL2, SACHER])
 SMALL: dict[Any, dict[str, Any]] = {
     RL2: {"n_trials_per_rollout": 1, "policy_kwargs": {"lstm_hidden_size": 4}},
-    SACHER: {"buffer_size": 2000},
+    SACHER: {"buffer_size": 2000, "policy_kwargs": {"net_arch": [4]}},
 }
 
 
@@ -126,8 +126,10 @@ def test_models_that_share_an_env_have_trials_of_their_own(tmp_path: Path) -> No
     other = RL2("MlpLstmPolicy", first.get_env(), n_trials_per_rollout=1)
     for model, n in ((first, 2), (again, 2), (other, 5)):
         assert model.env is not None and model.env.n_episodes == n and model.n_steps == 20 * n
+    before = again.env
     with pytest.raises(ValueError, match="give an env of the same time limit"):
         again.set_env(make_task_vec_env(ENV_ID, 2, env_kwargs={"max_episode_steps": 10}))
+    assert again.env is before
     env = other.get_env()
     assert env is not None
     first.set_env(env)

@@ -107,7 +107,7 @@ def test_what_chooses_nothing_is_refused(run: Path, more: list[str]) -> None:
 
 
 def test_what_a_killed_export_left_is_no_second_agent(run: Path, tmp_path: Path) -> None:
-    assert main(["export", str(run), "-o", str(tmp_path / "exported")]) == 0
+    assert main(["export", str(run), "-o", str(tmp_path / "exported"), "--n-episodes", "1"]) == 0
     (file,) = (tmp_path / "exported").glob("*.zip")
     shutil.copy(file, file.with_name(".half.tmp.zip"))
     assert agent_at(tmp_path / "exported").path == file
@@ -165,9 +165,9 @@ def test_export_is_small_exact_and_plain(run: Path, tmp_path: Path, tiny_pearl: 
     assert optimizer["state"] == {} and b"secret" not in file.read_bytes()
     assert not {"_last_obs", "ep_info_buffer", "_rng", "tensorboard_log", "_task_queue"} & data.keys()
     exported, untrusted = PEARL.load(file), load_untrusted(file, ENV_ID)
-    expected = record_adaptation(model, ENV_ID, n_episodes=3)
+    expected = record_adaptation(model, ENV_ID, "validation", n_episodes=3)
     for loaded in (exported, untrusted):
-        for ours, theirs in zip(expected, record_adaptation(loaded, ENV_ID, n_episodes=3), strict=True):
+        for ours, theirs in zip(expected, record_adaptation(loaded, ENV_ID, "validation", n_episodes=3), strict=True):
             np.testing.assert_array_equal(ours, theirs)
     assert exported.num_timesteps == model.num_timesteps and exported.gamma == model.gamma
     for loaded in (exported, untrusted):
@@ -461,7 +461,7 @@ def test_the_console_answers_mistakes_in_one_sentence(
         assert cli.console() == 1
         assert re.search(message, capsys.readouterr().err)
     monkeypatch.setenv("SB3_HTR_TRACEBACK", "1")
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match="goal_distance is -1"):
         cli.console()
     monkeypatch.delenv("SB3_HTR_TRACEBACK")
 

@@ -261,7 +261,7 @@ def test_importing_the_library_is_light() -> None:
 
 def test_a_training_leaves_the_process_as_it_was(tmp_path: Path) -> None:
     before = list(sys.argv)
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match="did you mean kl_coef"):
         main([*train_arguments(tmp_path), "kl_coeff:1"])
     assert main([*train_arguments(tmp_path), f"policy_kwargs:{TINY['policy_kwargs']}"]) == 0
     assert sys.argv == before
