@@ -1,23 +1,20 @@
 """Anything may come in; what comes out is a result that keeps its promises, or one sentence."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from helpers import ENV_ID, many
+from helpers import many
 from helpers.experience import make_buffer
 from htr_envs import PointRobotFamily, TargetSpeedFamily
 from sb3_htr.adaptation.explorers import EXPLORERS, to_explorer
 from sb3_htr.common.settings import keywords_of
 from sb3_htr.htr.relabel import RELABELLERS
-from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run.method import merged
-from sb3_htr.zoo.run.trust import EVALUATED, IMPORTED, plain_settings
+from sb3_htr.zoo.run.trust import plain_settings
 
 FAMILY = PointRobotFamily(n_train_tasks=5, n_test_tasks=2, n_validation_tasks=2)
 anything = st.one_of(
@@ -112,35 +109,22 @@ def test_add_and_sample(data: st.DataObject) -> None:
         assert len(lengths) == sizes[1] and (lengths >= 1).all() and (lengths <= largest).all()
 
 
+@pytest.mark.parametrize(
+    ("family", "names"),
+    [(PointRobotFamily, ["goal_distance", "goal_radius"]), (TargetSpeedFamily, ["min_speed", "max_speed", "tolerance"])],
+)
 @many
-@given(st.sampled_from([PointRobotFamily, TargetSpeedFamily]), st.data())
-def test_families(family: Any, data: st.DataObject) -> None:
-    names = ["goal_distance", "goal_radius", "n_train_tasks", "min_speed", "max_speed", "tolerance", "task_seed"]
-    number = st.one_of(st.integers(-2, 40), st.floats(-1, 12))
-    kwargs = data.draw(st.dictionaries(st.sampled_from(names), number, max_size=3))
+@given(data=st.data())
+def test_families(family: Any, names: list[str], data: st.DataObject) -> None:
+    number, of_sets = st.one_of(st.integers(-2, 40), st.floats(-1, 12)), ["n_train_tasks", "n_test_tasks", "task_seed"]
+    kwargs = data.draw(st.dictionaries(st.sampled_from([*names, *of_sets]), number, max_size=3))
     try:
         tasks = family(**kwargs).train_tasks
-    except (ValueError, TypeError) as error:
-        assert str(error)
+    except ValueError as error:
+        # Of a setting, or of what follows from one that is next to nothing
+        assert str(error).count("\n") == 0 and any(name in str(error) for name in (*kwargs, "train_tasks holds"))
     else:
         assert tasks.ndim == 2 and np.isfinite(tasks).all()
-
-
-CODE = "__import__('pathlib').Path({fuse!r}).touch()"
-
-
-@pytest.mark.parametrize("key", [*EVALUATED, *IMPORTED, "policy"])
-def test_yaml_files_run_no_code(key: str, tmp_path: Path) -> None:
-    fuse = tmp_path / "fuse"
-    file = tmp_path / "hostile.yml"
-    block = {"policy": "MlpPolicy", "n_timesteps": 100, "n_envs": 2, key: CODE.format(fuse=str(fuse))}
-    file.write_text(yaml.safe_dump({ENV_ID: block}))
-    with pytest.raises(ValueError, match=rf"hostile.yml has {key}: .*, which can run any code: add --trust"):
-        main(["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(file)])
-    file.write_text(f"{ENV_ID}: !!python/object/apply:os.system ['touch {fuse}']")
-    with pytest.raises(ValueError, match=r"hostile\.yml cannot be read"):
-        main(["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(file)])
-    assert not fuse.exists()
 
 
 @many

@@ -5,6 +5,7 @@ import hashlib
 import io
 import json
 import pickle
+import re
 import sqlite3
 import sys
 import zipfile
@@ -177,6 +178,10 @@ YAMLS: dict[str, Callable[[str], Any]] = {
 }
 
 
+# Settings whose values are named to be imported
+IMPORTED = {"callback", "env_wrapper", "vec_env_wrapper", "replay_buffer_class", "policy"}
+
+
 @pytest.mark.parametrize("change", YAMLS.values(), ids=YAMLS)
 def test_yaml_files(change: Callable[[str], Any], fuse: Path, tmp_path: Path) -> None:
     changed = change(code(fuse))
@@ -185,6 +190,15 @@ def test_yaml_files(change: Callable[[str], Any], fuse: Path, tmp_path: Path) ->
     with pytest.raises((ValueError, TypeError)) as refusal:
         main(["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(tmp_path / "hostile.yml")])
     assert "\n" not in str(refusal.value)
+    if IMPORTED & {*changed}:
+        assert re.search(r"hostile\.yml has \w+: .*, which can run any code: add --trust", str(refusal.value))
+    assert not fuse.exists()
+
+
+def test_objects_in_yaml_files(fuse: Path, tmp_path: Path) -> None:
+    (tmp_path / "hostile.yml").write_text(f"{ENV_ID}: !!python/object/apply:os.system ['touch {fuse}']")
+    with pytest.raises(ValueError, match=r"hostile\.yml cannot be read"):
+        main(["train", "--env", ENV_ID, "-f", str(tmp_path), "-conf", str(tmp_path / "hostile.yml")])
     assert not fuse.exists()
 
 
@@ -359,7 +373,7 @@ def test_checkpoints(fuse: Path, tmp_path: Path) -> None:
         manifest = json.loads((folder / MANIFEST).read_text())
         manifest["sha256"]["state.pt"] = hashlib.sha256(bomb).hexdigest()
         (folder / MANIFEST).write_text(json.dumps(manifest))
-        with pytest.raises(DamagedCheckpoint, match=r"1_steps.* is not what sb3-htr writes"):
+        with pytest.raises(DamagedCheckpoint, match=r"1_steps.* is not what sb3-htr writes, and may run code"):
             read_checkpoint(folder)
     assert not fuse.exists()
 
