@@ -2,6 +2,7 @@
 
 import warnings
 from functools import partial
+from typing import Any
 
 import pytest
 import torch as th
@@ -46,7 +47,8 @@ def test_the_posterior_is_watched() -> None:
 def test_a_collapsed_posterior_is_warned_of_in_training(tiny_pearl: MakePEARL) -> None:
     """By an encoder whose rows say nothing, and which stays as it is."""
     model = tiny_pearl(learning_rate=0.0, policy_kwargs=with_policy(encoder_class="PriorFactorEncoder"))
-    *_, last = model.encoder.factors.children()
+    factors: Any = model.encoder.factors
+    *_, last = factors.children()
     with th.no_grad():
         last.weight.zero_()
         last.bias.copy_(th.tensor([0.0] * 3 + [-20.0] * 3))
