@@ -51,7 +51,6 @@ TINY_RUN = Variant("htr-ser", "tiny", OF_CELL, {"n_test_tasks": 4})
 NODE = """
 import pickle, sys
 from pathlib import Path
-from types import SimpleNamespace
 import helpers.bucket
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.storage import objects

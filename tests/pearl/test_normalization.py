@@ -1,5 +1,6 @@
 """Normalized observations: a part of the policy."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -133,22 +134,22 @@ def test_without_it_observations_are_as_they_are(tiny_pearl: MakePEARL) -> None:
 
 def test_vec_normalize_is_refused(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
     """At once, and not only where a model is made; also one that normalizes nothing yet."""
-    kwargs = {"norm_obs": False, "norm_reward": False}
+    normalized = partial(VecNormalize, norm_obs=False, norm_reward=False)
     message = r"VecNormalize stands between .*policies normalize observations themselves"
     with pytest.raises(ValueError, match=message):
-        tiny_pearl(VecNormalize(make_task_vec_env(ENV_ID, 4), **kwargs))
+        tiny_pearl(normalized(make_task_vec_env(ENV_ID, 4)))
     tiny_pearl().save(tmp_path / "model")
     with pytest.raises(ValueError, match=message):
-        PEARL.load(tmp_path / "model", env=VecNormalize(make_task_vec_env(ENV_ID, 4), **kwargs))
+        PEARL.load(tmp_path / "model", env=normalized(make_task_vec_env(ENV_ID, 4)))
     loaded = PEARL.load(tmp_path / "model")
     with pytest.raises(ValueError, match=message):
-        loaded.set_env(VecNormalize(make_task_vec_env(ENV_ID, 4), **kwargs))
+        loaded.set_env(normalized(make_task_vec_env(ENV_ID, 4)))
     model = tiny_pearl()
     with pytest.raises(ValueError, match=message):
-        model.set_env(VecNormalize(make_task_vec_env(ENV_ID, 4), **kwargs))
+        model.set_env(normalized(make_task_vec_env(ENV_ID, 4)))
     assert not isinstance(model.env, VecNormalize)
     # It would act on other numbers than in training, and scores would be of other rewards
     with pytest.raises(ValueError, match=message):
-        evaluate_adaptation(model, VecNormalize(make_task_vec_env(ENV_ID, 4), **kwargs))
+        evaluate_adaptation(model, normalized(make_task_vec_env(ENV_ID, 4)))
     with pytest.raises(ValueError, match=message):
-        model.adapt(VecNormalize(make_task_vec_env(ENV_ID, 1), **kwargs))
+        model.adapt(normalized(make_task_vec_env(ENV_ID, 1)))
