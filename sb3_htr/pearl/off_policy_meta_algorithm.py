@@ -1,7 +1,7 @@
 """What off-policy meta-algorithms share in meta-training: rollouts that adapt, and a replay that is ordered by task."""
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, TypeVar, cast
 
@@ -21,7 +21,9 @@ from sb3_htr.adaptation.knowledge import LatentKnowledge
 from sb3_htr.adaptation.loop import adaptation_steps
 from sb3_htr.adaptation.task_bank import TaskBank
 from sb3_htr.common import checks
+from sb3_htr.common.callback import followed_by
 from sb3_htr.common.family_facts import check_same_family, family_facts
+from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.common.random_state import (
     checked_seed,
     get_generator_state,
@@ -140,6 +142,8 @@ class OffPolicyMetaAlgorithm(MetaTest, ReplayFiles, CheckedFiles, SAC):
         #: model has had no env yet
         self.max_episode_steps: int | None = None
         self.n_rollout_tasks: int | None = None
+        #: Called after each update
+        self.update_listeners: list[Callable[[], None]] = []
         self._n_rollouts = 0
         self._warn_once = WarnOnce()
 
@@ -327,15 +331,19 @@ class OffPolicyMetaAlgorithm(MetaTest, ReplayFiles, CheckedFiles, SAC):
         check_numbers(total_timesteps=(total_timesteps, 0.0))
         if log_interval is not None:
             check_numbers(log_interval=(log_interval, 1))
-        n_updates = self._n_updates
-        super().learn(
-            total_timesteps=total_timesteps,
-            callback=callback,
-            log_interval=log_interval,  # type: ignore[arg-type]
-            tb_log_name=tb_log_name,
-            reset_num_timesteps=reset_num_timesteps,
-            progress_bar=progress_bar,
-        )
+        n_updates, listeners = self._n_updates, list(self.update_listeners)
+        try:
+            super().learn(
+                total_timesteps=total_timesteps,
+                callback=callback,
+                log_interval=log_interval,  # type: ignore[arg-type]
+                tb_log_name=tb_log_name,
+                reset_num_timesteps=reset_num_timesteps,
+                progress_bar=progress_bar,
+            )
+        finally:
+            # A progress bar of a training that was interrupted is still there
+            self.update_listeners[:] = listeners
         if total_timesteps > 0:
             checks.warn_without_updates(self, n_updates)
             self._warn_without_successes()
@@ -352,6 +360,9 @@ class OffPolicyMetaAlgorithm(MetaTest, ReplayFiles, CheckedFiles, SAC):
                 f"longer than {self.num_timesteps} env steps, or see what is_success asks for.",
                 stacklevel=3,
             )
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        return super()._init_callback(followed_by(callback, MetaProgressBarCallback()) if progress_bar else callback)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         assert self.replay_buffer is not None
@@ -476,7 +487,7 @@ class OffPolicyMetaAlgorithm(MetaTest, ReplayFiles, CheckedFiles, SAC):
     # Files and state
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_rng", "_task_queue"]
+        return [*super()._excluded_save_params(), "update_listeners", "_rng", "_task_queue"]
 
     def state_dict(self) -> dict[str, Any]:
         return {**super().state_dict(), "task_queue": th.from_numpy(self._task_queue.copy())}

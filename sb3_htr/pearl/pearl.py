@@ -277,6 +277,8 @@ class PEARL(OffPolicyMetaAlgorithm):
             mean, log = fixed(padded(data, *sizes), update_target)
         log["relabelled_fraction"] = th.tensor(data.relabelled.mean())
         log["rl_zero_reward_fraction"] = th.tensor(data.unrewarded.mean())
+        for listener in self.update_listeners:
+            listener()
         return mean[: self.meta_batch_size], log
 
     def _gradient_step(self, data: MultiTaskSamples, update_target: bool) -> Outcome:

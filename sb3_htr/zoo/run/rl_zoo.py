@@ -15,6 +15,7 @@ from rl_zoo3.utils import ALGOS
 
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
 from sb3_htr.common.checkpoint_callback import CheckpointCallback
+from sb3_htr.common.progress import MetaProgressBarCallback
 from sb3_htr.zoo.run.algorithm import Algorithm
 from sb3_htr.zoo.run.callbacks import MetaTrialEvalCallback
 from sb3_htr.zoo.run.manager import MetaExperimentManager
@@ -55,6 +56,7 @@ def run_rl_zoo(
             "EvalCallback": MetaEvalCallback,
             "TrialEvalCallback": MetaTrialEvalCallback,
             "CheckpointCallback": CheckpointCallback,
+            "ProgressBarCallback": MetaProgressBarCallback,
             # It pickles studies alone
             "pkl": SimpleNamespace(dump=pickle_study),
         },
