@@ -14,6 +14,8 @@ from sb3_htr.common.errors import last_line
 
 # What torch says of a disk that is full, and zip files of a clock that they do not know, in errors that are no OSError
 OF_A_DISK = re.compile(r"PytorchStreamWriter|inline_container|iostream error")
+# Where something is written, Python does not say what
+OF_A_FULL_DISK = (errno.ENOSPC, errno.EDQUOT)
 OF_A_CLOCK = re.compile(r"\bZIP\b")
 
 
@@ -49,9 +51,13 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
                 os.fsync(parent)
             finally:
                 os.close(parent)
+    except OSError as error:
+        if error.errno in OF_A_FULL_DISK and error.filename is None:
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        raise
     except (RuntimeError, ValueError, struct.error) as error:
         if OF_A_DISK.search(str(error)):
-            raise OSError("torch could not write it, as on a full disk") from error
+            raise OSError(errno.EIO, "torch could not write it, as on a full disk", str(path)) from error
         if isinstance(error, struct.error) or OF_A_CLOCK.search(str(error)):
             raise OSError(last_line(error)) from error
         raise

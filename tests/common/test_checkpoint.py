@@ -15,6 +15,7 @@ import pytest
 import torch as th
 
 from helpers.bombs import Bomb
+from helpers.disks import disk
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checkpoint import (
     MANIFEST,
@@ -73,6 +74,12 @@ def test_files_are_synced_by_handles_that_may_write(tmp_path: Path, monkeypatch:
 def test_a_full_disk_is_told_from_an_error_of_the_program(error: Exception, expected: Any, tmp_path: Path) -> None:
     with pytest.raises(expected), atomic_path(tmp_path / "file"):
         raise error
+
+
+def test_a_full_disk_is_told_with_the_file_that_it_has_no_room_for(tmp_path: Path) -> None:
+    with disk(tmp_path, 16) as small, pytest.raises(OSError, match=rf"No space left on device: '{small / 'data'}'"):
+        with atomic_path(small / "data") as temporary:
+            temporary.write_bytes(bytes(2**16))
 
 
 def test_a_file_does_not_replace_a_folder(tmp_path: Path) -> None:

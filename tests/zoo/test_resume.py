@@ -274,6 +274,10 @@ def test_other_settings_are_refused_again_and_again(unbroken: Path, tmp_path: Pa
         with pytest.raises(ValueError, match=r"The hyperparameters \['gamma'\] have changed"):
             main(["train", "--resume", str(run), "-n", "240"])
         assert json.loads((run / "run.json").read_text()) == record
+    del record["hyperparams"]["gamma"], record["hyperparams"]["n_timesteps"]
+    (run / "run.json").write_text(json.dumps(record))
+    with pytest.raises(ValueError, match=r"The hyperparameters \['n_timesteps'\] have changed"):
+        main(["train", "--resume", str(run)])
 
 
 def test_the_last_one_cleans_up(unbroken: Path, tmp_path: Path) -> None:

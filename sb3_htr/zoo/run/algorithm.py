@@ -128,7 +128,7 @@ ALGORITHMS = {
             "pearl",
             PEARL,
             "pearl.yml",
-            "It is not told its task: it tries a few episodes, infers the task from sparse rewards, and then solves it.",
+            "It is not told its task: it tries a few episodes, and infers the task from their rewards.",
             also_explores_by=("prior",),
             search_space=search_space.PEARL,
             owners={"replay_buffer_kwargs": MultiTaskReplayBuffer, "policy_kwargs": PEARLPolicy},

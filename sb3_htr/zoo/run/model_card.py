@@ -229,7 +229,7 @@ An agent of {about}, trained with `sb3_htr` on Stable-Baselines3. {algorithm.abo
 ## Scores
 
 Undiscounted return (mean ± standard deviation over tasks) and share of tasks solved, on {n_tasks} test tasks that training
-has not seen, with mean actions.{of_explorers}
+has not seen, with mean actions and seed 0.{of_explorers}
 
 {table(scores)}
 

@@ -1,6 +1,7 @@
 """The record of a run: what it was begun with, and by which code and on which machines it went on."""
 
 import json
+import math
 import shlex
 import warnings
 from pathlib import Path
@@ -93,7 +94,7 @@ def record_going_on(
     :raises ValueError: if something else than a larger budget has changed
     """
     before, now = record["hyperparams"], json.loads(json.dumps(hyperparams, default=str))
-    is_longer = before["n_timesteps"] < now["n_timesteps"]
+    is_longer = before.get("n_timesteps", math.inf) < now["n_timesteps"]
     changed = sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
     if is_longer:
         changed.remove("n_timesteps")
