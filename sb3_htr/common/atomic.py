@@ -30,7 +30,10 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     :raises OSError: if the folder, or the file to its end, cannot be written to
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except FileExistsError as error:
+        raise NotADirectoryError(errno.ENOTDIR, "This is a file, expected a folder", str(path.parent)) from error
     if not os.access(path.parent, os.W_OK):  # before whoever writes has done any work
         raise PermissionError(errno.EACCES, "The folder cannot be written to", str(path.parent))
     # In a container, each process may be number 1

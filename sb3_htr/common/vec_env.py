@@ -2,9 +2,10 @@
 
 import importlib
 import os
+import re
 import signal
-from collections.abc import Callable, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from itertools import count
 from multiprocessing.process import BaseProcess
 from multiprocessing.util import Finalize
@@ -204,13 +205,15 @@ def make_task_vec_env(
             env = gym.make(spec, **env_kwargs)
             return env if wrapper is None else wrapper(env)
 
-        venv = (vec_env_class or DummyVecEnv)([make_env] * n_envs)
+        with arguments_are_known(env_id, env_kwargs):
+            venv = (vec_env_class or DummyVecEnv)([make_env] * n_envs)
         if isinstance(venv, SubprocVecEnv):
             # Where nobody closes it: at exit, multiprocessing waits for these processes, after a SIGTERM, which they ignore
             Finalize(venv, _kill, [venv.processes], exitpriority=0)
         check_has_task_family(venv.has_attr("task_family"))
     else:
-        vector_env = gym.make_vec(env_id, n_envs, vectorization_mode="vector_entry_point", **env_kwargs)
+        with arguments_are_known(env_id, env_kwargs):
+            vector_env = gym.make_vec(env_id, n_envs, vectorization_mode="vector_entry_point", **env_kwargs)
         check_has_task_family(hasattr(vector_env, "task_family"))
         venv = BatchedTaskVecEnv(vector_env)
     family = venv.get_attr("task_family", [0])[0]
@@ -224,6 +227,27 @@ def make_task_vec_env(
     if seed is not None:
         monitored.seed(seed)
     return monitored
+
+
+@contextmanager
+def arguments_are_known(env_id: str, env_kwargs: dict[str, Any]) -> Iterator[None]:
+    """
+    Around what makes an env, as Python names the class of ours, or of whoever made it, that lacks an argument.
+
+    :param env_id: a registered id
+    :param env_kwargs: arguments of the env
+    :raises ValueError: if it takes one of them not
+    """
+    try:
+        yield
+    except TypeError as error:
+        unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
+        if unknown is None or unknown[1] not in env_kwargs:
+            raise
+        raise ValueError(
+            f"{env_id} takes no argument {unknown[1]!r}: leave it out, or correct it. The documentation of the env, and of "
+            "its task family, has those that it takes."
+        ) from error
 
 
 def _kill(processes: list[BaseProcess]) -> None:

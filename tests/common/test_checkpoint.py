@@ -82,6 +82,14 @@ def test_a_full_disk_is_told_with_the_file_that_it_has_no_room_for(tmp_path: Pat
             temporary.write_bytes(bytes(2**16))
 
 
+def test_a_file_is_no_folder_to_write_to(tmp_path: Path) -> None:
+    (tmp_path / "results").write_text("precious")
+    with pytest.raises(OSError, match=rf"This is a file, expected a folder: '{tmp_path / 'results'}'"):
+        with atomic_path(tmp_path / "results" / "data"):
+            pass
+    assert (tmp_path / "results").read_text() == "precious"
+
+
 def test_a_file_does_not_replace_a_folder(tmp_path: Path) -> None:
     (tmp_path / "model.zip").mkdir()
     (tmp_path / "model.zip" / "precious").touch()

@@ -536,6 +536,7 @@ def test_the_command_runs_in_a_store_and_reports_from_it(
     ("runs", "message"),
     [
         ("nope://bucket/runs", r"nope://bucket/runs cannot be opened \(Protocol not known: nope\): give a folder, or a URL"),
+        ("ftp://nowhere.invalid/runs", r"ftp://nowhere.invalid/runs cannot be opened \(.*\): give a folder, or a URL"),
         ("memory://", "memory:// names no place in a store: give one, as in s3://bucket/runs"),
         ("s3:/bucket/runs", "The folder of the runs is 's3:/bucket/runs': give a URL as text, with two slashes"),
         (Path("s3://bucket/runs"), "The folder of the runs is 's3:/bucket/runs': give a URL as text, with two slashes"),

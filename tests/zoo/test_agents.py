@@ -119,7 +119,7 @@ def test_what_cannot_be_written_is_said_before_the_work(run: Path, tmp_path: Pat
 
     monkeypatch.setattr("sb3_htr.zoo.commands.evaluate.record_adaptation", work)
     (tmp_path / "file").touch()
-    with pytest.raises(FileExistsError):
+    with pytest.raises(NotADirectoryError, match="This is a file, expected a folder"):
         main(["evaluate", str(run), "-o", str(tmp_path / "file")])
 
 
@@ -453,7 +453,10 @@ def test_the_console_answers_mistakes_in_one_sentence(
     for arguments, message in (
         (["enjoy", "--env", "Nothing-v0"], "There is no trained agent for Nothing-v0"),
         (["evaluate", "--env", "SparsePointRobt-v0"], "no such env: did you mean SparsePointRobot-v0"),
-        (["train", "--env", ENV_ID, "--env-kwargs", "goal_dist:1"], "TypeError: .* unexpected keyword argument 'goal_dist'"),
+        (
+            ["train", "--env", ENV_ID, "--env-kwargs", "goal_dist:1"],
+            "SparsePointRobot-v0 takes no argument 'goal_dist': leave it out",
+        ),
         (["train", "--env", "SparsePointRobt-v0"], "did you mean SparsePointRobot-v0"),
         (["evaluate", str(SHIPPED), "--env-kwargs", "goal_distance:-1"], "goal_distance is -1, expected a number above 0"),
     ):

@@ -111,7 +111,28 @@ def test_an_export_folder_is_this_model_and_nothing_else(hub: Hub, tmp_path: Pat
     Path("shared", "thesis.tex").unlink()
     with pytest.raises(ValueError, match="--n-episodes is 0"):
         main([*arguments, "--n-episodes", "0"])
+    with pytest.raises(ValueError, match="Repo id must be in the form"):
+        main([*arguments, "--push-to-hub", "a/b/c"])
     assert names("shared") == [".gitattributes", "README.md", MODEL], "nothing is lost by a slip"
+
+
+def test_an_export_that_is_stopped_while_it_is_scored_leaves_the_one_before(
+    tmp_path: Path, tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    make_run(tmp_path / "runs", tiny_pearl(), env_kwargs=NEAR)
+    arguments = ["export", "runs", "--n-episodes", "1", "-o", "shared"]
+    assert main(arguments) == 0
+    before = {path.name: path.read_bytes() for path in Path("shared").iterdir()}
+
+    def stopped(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sb3_htr.zoo.commands.export.record_adaptation", stopped)
+    make_run(tmp_path / "runs", tiny_pearl(seed=1), 2, env_kwargs=NEAR)
+    with pytest.raises(KeyboardInterrupt):
+        main(arguments)
+    assert {path.name: path.read_bytes() for path in Path("shared").iterdir()} == before
 
 
 @pytest.mark.parametrize(("env_id", "normalized"), [(ENV_ID, False), ("SparseWheeled-v0", True)])

@@ -329,6 +329,9 @@ def test_bad_storages_are_named_in_one_sentence(quick: None, tmp_path: Path) -> 
         search(tmp_path, "study.db")
     with pytest.raises(ValueError, match=r"The storage sqlite:////nowhere/study.db cannot be used: unable to open"):
         search(tmp_path, "sqlite:////nowhere/study.db")
+    with pytest.raises(ValueError, match=r"database of mysql, for which a package is missing \(.*\): install it") as refusal:
+        search(tmp_path, "mysql://me:secret@host/studies")
+    assert "secret" not in str(refusal.value)
 
 
 def test_a_torn_journal_is_named_and_left_alone(at_once: None, tmp_path: Path) -> None:

@@ -279,7 +279,7 @@ def _report(error: Exception) -> None:
 def _opened(url: str) -> tuple[AbstractFileSystem, str]:
     try:
         files, root = url_to_fs(url)
-    except (ValueError, ImportError) as error:
+    except (ValueError, ImportError, OSError) as error:
         raise ValueError(f"{_shown(url)} cannot be opened ({last_line(error)}): give a folder, or a URL of fsspec.") from None
     if not root.strip("/"):
         raise ValueError(f"{_shown(url)} names no place in a store: give one, as in s3://bucket/runs.")

@@ -13,13 +13,12 @@ from sb3_htr.htr.relabel.hindsight_buffers import HindsightBuffers
 
 class TrainingTaskRelabelling(HindsightBuffers):
     """
-    Experience goes to the hindsight buffers of training tasks. A unit of it, an episode or a transition, goes to the task psi
-    with probability
+    Episodes go to the hindsight buffers of training tasks. An episode goes to the task psi with probability
 
-        q(psi | unit) proportional to exp(U(unit, psi) / temperature - log Z(psi)),
+        q(psi | episode) proportional to exp(U(episode, psi) / temperature - log Z(psi)),
 
-    where U is the utility that a subclass defines, and Z(psi) the mean of exp(U / temperature) over the units that have come
-    in together. Without Z, an easy task would get everything.
+    where U is the utility that a subclass defines, and Z(psi) the mean of exp(U / temperature) over the episodes that have
+    come in together. Without Z, an easy task would get everything.
 
     Relabelling is eager, as in HFR's code: once, when the first meta-batch after a rollout is drawn, with the networks as they
     are then. A relabelled row of a meta-batch is drawn as PEARL draws it, from any hindsight buffer that holds something, with
@@ -42,13 +41,13 @@ class TrainingTaskRelabelling(HindsightBuffers):
         """
         :param rows: (n, width) float32, transitions of some episodes, those of the first one first
         :param lengths: (n_episodes,) int, how many are of each
-        :return: (n_units, n_tasks), utility of each unit for each training task. As many units as episodes or as transitions
+        :return: (n_episodes, n_tasks), utility of each episode for each training task
         """
 
     def reset(self) -> None:
         self.make_buffers(self.buffer.n_tasks)
         self._new: list[np.ndarray] = []
-        # Of the units that came in last: mean entropy of q in nats
+        # Of the episodes that came in last: mean entropy of q in nats
         self._entropy = 0.0
 
     def on_episode(self, task: int, episode: np.ndarray) -> None:
@@ -75,8 +74,8 @@ class TrainingTaskRelabelling(HindsightBuffers):
             self.episodes.add(int(task), episode)
 
     def _choose(self, logits: np.ndarray) -> np.ndarray:
-        """(n_units,) int, a task for each unit."""
-        # Each task's partition function, a mean over the units: by how much the sum is larger is the same for all tasks
+        """(n_episodes,) int, a task for each."""
+        # Each task's partition function, a mean over the episodes: by how much the sum is larger is the same for all tasks
         logits = logits - np.logaddexp.reduce(logits, axis=0)
         log_q = logits - np.logaddexp.reduce(logits, axis=1, keepdims=True)
         self._entropy = float(-(np.exp(log_q) * log_q).sum(axis=1).mean())

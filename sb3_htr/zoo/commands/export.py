@@ -1,13 +1,16 @@
 """``sb3-htr export``: a small file to share, and what to say about it."""
 
+import argparse
 import dataclasses
 import json
 import zipfile
 from collections.abc import Sequence
+from contextlib import nullcontext
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
+from huggingface_hub.utils import validate_repo_id
 from stable_baselines3 import SAC
 
 from sb3_htr.adaptation.evaluation import record_adaptation
@@ -95,6 +98,15 @@ def _needs_trust(agent: TrainedAgent, device: str) -> bool:
     return False
 
 
+def _card(exported: TrainedAgent, args: argparse.Namespace, repo_id: str | None) -> str:
+    """With the scores of what was exported."""
+    model, env = exported.load(args.device), exported.make_vec_env(N_ENVS)
+    tasks = get_task_family(env).test_tasks
+    explorers = dict.fromkeys([model.explorer.name, *exported.algorithm.also_explores_by])
+    scores = {explorer: record_adaptation(model, env, tasks, args.n_episodes, explorer=explorer) for explorer in explorers}
+    return model_card(exported.record, scores, repo_id, args.trust and _needs_trust(exported, args.device))
+
+
 def main(argv: Sequence[str]) -> None:
     """The command, with its arguments."""
     description = "Write an agent as a small model file with a model card: scores after adaptation, how to load it."
@@ -119,22 +131,20 @@ def main(argv: Sequence[str]) -> None:
         raise ValueError(f"--push-to-hub and --film need a folder, but the output is the file {output}.")
     name = model_name(agent.env_id, agent.algorithm.name)
     left = [] if alone else earlier_export(output, files(name))
+    repo_id = args.push_to_hub
+    if repo_id is not None:
+        repo_id += "" if "/" in repo_id else f"/{name}"
+        validate_repo_id(repo_id)
     file = output if alone else output / f"{name}.zip"
-    record = export(agent, file)
+    # Both at once, as a model with the card of another is worse than none
+    with atomic_path(file) as model_file, nullcontext() if alone else atomic_path(output / CARD) as page:
+        record = export(agent, model_file)
+        if page is not None:
+            exported = dataclasses.replace(agent, path=model_file, record=record, folder=None)
+            page.write_text(_card(exported, args, repo_id), encoding="utf-8")
     print(f"{file}: {file.stat().st_size / 1e6:.2f} MB, of {agent.path}")
     if alone:
         return
-    exported = dataclasses.replace(agent, path=file, record=record, folder=None)
-    model, env = exported.load(args.device), exported.make_vec_env(N_ENVS)
-    tasks = get_task_family(env).test_tasks
-    explorers = dict.fromkeys([model.explorer.name, *exported.algorithm.also_explores_by])
-    scores = {explorer: record_adaptation(model, env, tasks, args.n_episodes, explorer=explorer) for explorer in explorers}
-    repo_id = args.push_to_hub
-    if repo_id is not None and "/" not in repo_id:
-        repo_id += f"/{name}"
-    with atomic_path(output / CARD) as temporary:
-        card = model_card(record, scores, repo_id, args.trust and _needs_trust(exported, args.device))
-        temporary.write_text(card, encoding="utf-8")
     # Not before there is a new card: what an earlier export has left tells of another model
     for path in left:
         if path not in (file, output / CARD):

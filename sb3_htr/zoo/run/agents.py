@@ -22,7 +22,7 @@ from sb3_htr.common.checks import check_device
 from sb3_htr.common.digest import is_whole_zip
 from sb3_htr.common.errors import last_line
 from sb3_htr.common.settings import name_of
-from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.common.vec_env import arguments_are_known, make_task_vec_env
 from sb3_htr.zoo.run.algorithm import Algorithm, Model
 from sb3_htr.zoo.run.folder import run_number
 from sb3_htr.zoo.run.method import DEFAULT, OWN, get_method, methods
@@ -110,7 +110,8 @@ class TrainedAgent:
         drawn: dict[str, Any] = {} if render_mode is None else {"render_mode": render_mode}
         wrap = self._wrapper(ENV_WRAPPER) or (lambda env: env)
         try:
-            return wrap(gym.make(self.env_id, **self.env_kwargs, **drawn))
+            with arguments_are_known(self.env_id, self.env_kwargs):
+                return wrap(gym.make(self.env_id, **self.env_kwargs, **drawn))
         except TypeError as error:
             if not drawn or "'render_mode'" not in str(error):
                 raise

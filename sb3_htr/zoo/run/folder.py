@@ -33,7 +33,7 @@ def claim(log_folder: str, stem: str, suffix: str) -> Path:
         number += 1
         folder = Path(log_folder, f"{stem}_{number}{suffix}")
         try:
-            folder.mkdir()
+            folder.mkdir(parents=True)  # another process, which was refused, may have removed those above
         except FileExistsError:
             continue
         return folder

@@ -44,9 +44,12 @@ def opened(storage: str) -> JournalStorage | str:
     """
     :param storage: as given
     :return: for Optuna
-    :raises ValueError: if it is neither journal nor database, or a journal with a line that is not whole
+    :raises ValueError: if it is neither journal nor database, a database without its package, or a journal with a line that is
+        not whole
     """
-    if url_of(storage) is not None:
+    if (url := url_of(storage)) is not None:
+        if url.get_backend_name() not in ("sqlite", "postgresql"):
+            _check_driver(url)
         return storage
     file = Path(storage)
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -59,6 +62,16 @@ def opened(storage: str) -> JournalStorage | str:
     except ValueError:
         raise ValueError(
             f"The storage {storage} cannot be used, as its last line, or one before, is damaged: remove that line."
+        ) from None
+
+
+def _check_driver(url: sqlalchemy.URL) -> None:
+    try:
+        url.get_dialect().import_dbapi()
+    except (sqlalchemy.exc.ArgumentError, ImportError) as error:
+        raise ValueError(
+            f"--storage is a database of {url.drivername}, for which a package is missing ({error}): install it, or give "
+            "sqlite:///FILE, postgresql+psycopg://USER:PASSWORD@HOST/DATABASE or FILE.log."
         ) from None
 
 

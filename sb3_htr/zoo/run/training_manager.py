@@ -46,6 +46,8 @@ class TrainingManager(MetaExperimentManager):
         super().__init__(*args, **kwargs)
         self._unique = kwargs.get("uuid_str", "")
         self._claimed: Path | None = None
+        # Folders above it that were not there before, from the inside out
+        self._made: list[Path] = []
         # The record of a run that goes on otherwise than it was begun
         self._going_on: dict[str, Any] | None = None
         self._lock: SystemLock | None = None
@@ -86,6 +88,9 @@ class TrainingManager(MetaExperimentManager):
         except BaseException as error:
             if self._claimed is not None:  # nothing was trained in it
                 shutil.rmtree(self._claimed)
+            for folder in self._made:
+                with contextlib.suppress(OSError):  # others may be in it
+                    folder.rmdir()
             if self._lock is not None:
                 self._lock.release()
             if isinstance(error, OSError) and error.filename is None and error.errno == errno.ENOSPC:
@@ -99,6 +104,7 @@ class TrainingManager(MetaExperimentManager):
         if self.resumed is None:
             # An env that cannot be trained on should say so before there is a folder
             make_task_vec_env(self.env_name.gym_id, env_kwargs=self.env_kwargs, wrapper=self.env_wrapper).close()
+            self._made = [path for path in (Path(self.log_path), *Path(self.log_path).parents) if not path.exists()]
             self._claimed = claim(self.log_path, self.env_name, self._unique)
             self.save_path = str(self._claimed)
             self._lock = lock(self._claimed)
