@@ -118,6 +118,24 @@ def test_hindsight_buffers_of_another_grid_are_refused() -> None:
     assert relabeller.n_hindsight_buffers > 1
 
 
+class Sectors(EpisodeClustering):
+    """Cells of one's own: 36 directions at distance 1, of whose middles some round to others."""
+
+    def cells(self, tasks: np.ndarray) -> np.ndarray:
+        angle = np.floor(np.arctan2(tasks[:, 1], tasks[:, 0]) / (np.pi / 18)) * (np.pi / 18)
+        return np.stack([np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
+
+
+def test_cells_of_ones_own_are_loaded_as_they_were() -> None:
+    buffer, other = (make_buffer(buffer_size=16_000, relabeller=Sectors()) for _ in range(2))
+    rng = np.random.default_rng(0)
+    for i in range(30):
+        add_episode(buffer, [i % 5, 5 + i % 7], 20, rng)
+    other.load_state_dict(buffer.state_dict())
+    assert isinstance(buffer.relabeller, Sectors) and isinstance(other.relabeller, Sectors)
+    assert other.relabeller.n_hindsight_buffers == buffer.relabeller.n_hindsight_buffers > 1
+
+
 def test_pearl_trains_with_it(tiny_pearl: MakePEARL) -> None:
     model = tiny_pearl(replay_buffer_kwargs={"relabeller": {"name": "EpisodeClustering", "cell_size": 0.1}}).learn(480)
     assert model.replay_buffer is not None
