@@ -3,7 +3,9 @@
 import io
 import pathlib
 import sys
-from collections.abc import Iterable
+import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -14,7 +16,24 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.errors import last_line
 from sb3_htr.common.settings import check_keywords, check_mappings, keywords_of
+
+
+@contextmanager
+def _settings_are_read(path: object, names: Iterable[str]) -> Iterator[None]:
+    """SB3 warns of what cannot be unpickled, and goes on with the default in its place."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", rf"Could not deserialize object ({'|'.join(names)})\.", UserWarning)
+        try:
+            yield
+        except UserWarning as error:
+            name = str(error).split(". ")[0].split()[-1]
+            raise ValueError(
+                f"{path} has a {name} that cannot be read, as it is of another version of some package "
+                f"({last_line(error)}): give all of it, as {name}=..., or load it by that version."
+            ) from error
+
 
 SelfCheckedFiles = TypeVar("SelfCheckedFiles", bound="CheckedFiles")
 
@@ -86,7 +105,7 @@ class CheckedFiles(BaseAlgorithm):
         :param force_reset: reset the env before training goes on
         :param kwargs: settings in place of those of the file; of ``replay_buffer_kwargs``, those that are given
         :return: the model
-        :raises ValueError: for an unknown setting, or a file of another algorithm
+        :raises ValueError: for an unknown setting, one that cannot be read, or a file of another algorithm
         :raises OSError: if there is no such file, or it is a folder
         """
         cls.check_names(kwargs, keywords_of(BaseAlgorithm.load))
@@ -107,7 +126,8 @@ class CheckedFiles(BaseAlgorithm):
             if "replay_buffer_kwargs" in kwargs:
                 of_both = (theirs.get("replay_buffer_kwargs"), kwargs["replay_buffer_kwargs"])
                 kwargs["replay_buffer_kwargs"] = {name: x for given in of_both for name, x in (given or {}).items()}
-        model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        with _settings_are_read(path, keywords_of(cls) - kwargs.keys()):
+            model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         state = vars(model)
         if "ent_coef_tensor" in state:  # SB3 has put that of the file in the place of one that was given
             state["ent_coef_tensor"] = th.tensor(float(state["ent_coef"]), device=model.device)

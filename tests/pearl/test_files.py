@@ -540,3 +540,19 @@ def test_a_folder_of_a_models_name_is_not_in_its_way(tiny_pearl: MakePEARL, tmp_
         IsADirectoryError, match=r"is a folder, expected a model file, such as one of \['model.zip'\] in it\.$"
     ):
         PEARL.load(tmp_path)
+
+
+def test_a_setting_that_cannot_be_read_is_not_the_default(
+    tmp_path: Path, tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As one of a class that is gone; SB3 warns, and goes on without."""
+    gone = type("Gone", (EpisodeClustering,), {"__module__": "sb3_htr.htr", "__qualname__": "Gone"})
+    with monkeypatch.context() as patch:
+        patch.setattr("sb3_htr.htr.Gone", gone, raising=False)
+        tiny_pearl(replay_buffer_kwargs={"relabeller": gone(), "relabel_probability": 0.3}).save(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"model has a replay_buffer_kwargs that cannot be read.*'Gone'.*give all of it"):
+        PEARL.load(tmp_path / "model")
+    given = {"relabeller": EpisodeClustering(), "relabel_probability": 0.3}
+    with pytest.warns(UserWarning, match="Could not deserialize object replay_buffer_kwargs"):
+        model = PEARL.load(tmp_path / "model", replay_buffer_kwargs=given)
+    assert model.replay_buffer_kwargs == given
