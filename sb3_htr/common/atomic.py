@@ -14,9 +14,9 @@ from sb3_htr.common.errors import last_line
 
 # What torch says of a disk that is full, and zip files of a clock that they do not know, in errors that are no OSError
 OF_A_DISK = re.compile(r"PytorchStreamWriter|inline_container|iostream error")
-# Where something is written, Python does not say what
-OF_A_FULL_DISK = (errno.ENOSPC, errno.EDQUOT)
 OF_A_CLOCK = re.compile(r"\bZIP\b")
+# Errors that Python raises without the name of the file that is written
+OF_A_FULL_DISK = (errno.ENOSPC, errno.EDQUOT)
 
 
 @contextmanager

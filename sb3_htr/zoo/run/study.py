@@ -48,7 +48,7 @@ def opened(storage: str) -> JournalStorage | str:
         not whole
     """
     if (url := url_of(storage)) is not None:
-        if url.get_backend_name() not in ("sqlite", "postgresql"):
+        if url.get_backend_name() not in ("sqlite", "postgresql"):  # for which the command names the extra
             _check_driver(url)
         return storage
     file = Path(storage)
