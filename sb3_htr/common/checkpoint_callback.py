@@ -59,14 +59,14 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def cut_monitor_files(run: Path, sizes: dict[str, int]) -> None:
+def cut_monitor_files(files: Sequence[Path], sizes: dict[str, int]) -> None:
     """
     Forget the episodes after a checkpoint.
 
-    :param run: folder of a run, whose envs are not made yet
+    :param files: monitor files of a run, but for those that are being written
     :param sizes: of the monitor files when the checkpoint was made
     """
-    for path in run.glob("*.monitor.csv"):
+    for path in files:
         if path.name in sizes:
             with atomic_path(path) as temporary:
                 temporary.write_bytes(path.read_bytes()[: sizes[path.name]])

@@ -452,6 +452,7 @@ def test_the_console_answers_mistakes_in_one_sentence(
 ) -> None:
     for arguments, message in (
         (["enjoy", "--env", "Nothing-v0"], "There is no trained agent for Nothing-v0"),
+        (["enjoy", "--env", ENV_ID, "--algo", "ppo"], "--algo ppo chooses nothing here"),
         (["evaluate", "--env", "SparsePointRobt-v0"], "no such env: did you mean SparsePointRobot-v0"),
         (
             ["train", "--env", ENV_ID, "--env-kwargs", "goal_dist:1"],
@@ -528,3 +529,5 @@ def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixtu
 def test_tables_show_the_last_episode() -> None:
     record = AdaptationRecord(np.ones((2, 7)), np.ones((2, 7), dtype=bool), np.zeros((2, 7, 1, 1), dtype=np.float32))
     assert [line.split()[1] for line in model_card.table({"belief": record}).splitlines()[2:]] == ["1", "2", "3", "5", "7"]
+    untold = record._replace(successes=~record.successes)
+    assert "none known" in model_card.table({"belief": untold}) and "0%" not in model_card.table({"belief": untold})

@@ -120,9 +120,9 @@ def test_an_older_checkpoint_has_its_own_episodes(tmp_path: Path) -> None:
     """It went on from a later one, which was found damaged afterwards."""
     first, second = (tmp_path / f"{i}.monitor.csv" for i in range(2))
     first.write_text("123456789")
-    cut_monitor_files(tmp_path, {first.name: 6})
+    cut_monitor_files([first], {first.name: 6})
     second.write_text("abcdefghi")
-    cut_monitor_files(tmp_path, {first.name: 3})
+    cut_monitor_files([first, second], {first.name: 3})
     assert [*tmp_path.iterdir()] == [first] and first.read_text() == "123"
 
 
@@ -270,10 +270,12 @@ def test_other_settings_are_refused_again_and_again(unbroken: Path, tmp_path: Pa
     # As if the YAML file had been changed since
     record["hyperparams"]["gamma"] = 0.123
     (run / "run.json").write_text(json.dumps(record))
+    episodes = (run / "0.monitor.csv").read_bytes()
     for _ in range(2):
         with pytest.raises(ValueError, match=r"The hyperparameters \['gamma'\] have changed"):
             main(["train", "--resume", str(run), "-n", "240"])
         assert json.loads((run / "run.json").read_text()) == record
+        assert (run / "0.monitor.csv").read_bytes() == episodes, "older files of these settings may go on from them"
     del record["hyperparams"]["gamma"], record["hyperparams"]["n_timesteps"]
     (run / "run.json").write_text(json.dumps(record))
     with pytest.raises(ValueError, match=r"The hyperparameters \['n_timesteps'\] have changed"):

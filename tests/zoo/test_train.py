@@ -82,6 +82,8 @@ def test_the_table_says_what_was_solved_in_an_episode_and_so_far() -> None:
         ["2", "1.00", "0.50", "..", "1.50", "50%", "50%"],
         ["3", "0.00", "0.00", "..", "0.00", "0%", "50%"],
     ]
+    untold = table(AdaptationRecord(1.0 * successes, np.zeros_like(successes), np.zeros((2, 3, 1, 2)))).splitlines()
+    assert "info['is_success'] tells of none" in untold[-1], "a family may not know, and its agent is not the one that fails"
 
 
 def test_evaluations_of_one_run_do_not_replace_each_other(runs: Path, tmp_path: Path) -> None:

@@ -69,6 +69,7 @@ def add_agent_arguments(parser: argparse.ArgumentParser, several: bool = False) 
     group.add_argument("-f", "--folder", type=Path, default=Path("logs"), help="log folder (default: logs)")
     group.add_argument("--exp-id", type=int, default=0, metavar="N", help="number of the run, 0 (default) for the latest")
     group.add_argument("--method", metavar="NAME", help="method that it was trained by, such as htr-ec")
+    group.add_argument("--algo", help=argparse.SUPPRESS)  # of rl_zoo3's commands
     group.add_argument("--model", choices=["best", "last"], default="best", help="of a run: best on validation tasks, or last")
     group.add_argument("--load-best", dest="model", action="store_const", const="best", help="the same as --model best")
     group.add_argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help=OF_PACKAGES)
@@ -114,6 +115,10 @@ def chosen_agent(parser: argparse.ArgumentParser, args: argparse.Namespace, path
     :return: the agent; its env is registered
     :raises ValueError: if arguments contradict each other, or the device cannot be used
     """
+    if args.algo is not None:
+        raise ValueError(
+            f"--algo {args.algo} chooses nothing here, as each run knows its algorithm: leave it out, or give --method NAME."
+        )
     check_device(args.device)
     for name, limits in {"n_episodes": (1,), "n_timesteps": (1,), "fps": (0.1,), "seed": (0, MAX_SEED)}.items():
         if getattr(args, name, None) is not None:

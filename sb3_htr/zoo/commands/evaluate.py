@@ -31,6 +31,8 @@ def table(record: AdaptationRecord) -> str:
             f"{i + 1:7d}   {record.returns[:, i].mean():11.2f}   {spread:>20}   {record.successes[:, i].mean():6.0%}"
             f"   {found[i]:13.0%}"
         )
+    if not record.successes.any():
+        lines.append("info['is_success'] tells of none: no task was solved, or the env does not say which are.")
     return "\n".join(lines)
 
 

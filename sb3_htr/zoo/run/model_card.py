@@ -128,7 +128,9 @@ def table(scores: dict[str, AdaptationRecord]) -> str:
         cells = [str(i)]
         for record in scores.values():
             returns = record.returns[:, i - 1]
-            cells += [f"{returns.mean():.2f} ± {returns.std():.2f}", f"{record.successes[:, i - 1].mean():.0%}"]
+            # An env may not say which tasks are solved
+            solved = f"{record.successes[:, i - 1].mean():.0%}" if record.successes.any() else "none known"
+            cells += [f"{returns.mean():.2f} ± {returns.std():.2f}", solved]
         lines.append(cells)
     return markdown_table(head, lines)
 

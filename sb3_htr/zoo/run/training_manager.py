@@ -115,7 +115,7 @@ class TrainingManager(MetaExperimentManager):
                 with training_goes_on(str(left), "removed"):
                     left.unlink()
             folder, self._checkpoint = load_latest(self.resumed)
-            cut_monitor_files(self.resumed, self._checkpoint["monitor_files"])
+            self._monitor_files = sorted(self.resumed.glob("*.monitor.csv"))
             print(f"Going on from {folder}")
         self.params_path = f"{self.save_path}/{self.env_name}"
         super().create_log_folder()
@@ -149,7 +149,9 @@ class TrainingManager(MetaExperimentManager):
             assert self._checkpointing is not None, "a run that has a checkpoint makes them"
             self._checkpointing.restore(cast(Any, model), self._checkpoint)
             done = model.num_timesteps
-            if self._going_on is not None:  # not before: a run that is refused has the plan that it had
+            # Not before: a run that is refused has the episodes and the plan that it had
+            cut_monitor_files(self._monitor_files, self._checkpoint["monitor_files"])
+            if self._going_on is not None:
                 write_record(Path(self.save_path), self._going_on)
         log_interval = {-1: 1}.get(self.log_interval, self.log_interval if self.log_interval > 0 else None)
         with contextlib.ExitStack() as on_failure, soft_interrupt(self._checkpointing):
