@@ -539,6 +539,11 @@ def test_a_name_is_of_one_class() -> None:
         register_encoder(Prior)  # type: ignore[type-var]
 
 
+def test_a_class_derived_from_an_explorer_of_the_package_has_its_own_name() -> None:
+    for kind in EXPLORERS.values():
+        assert to_explorer(type("Mine", (kind,), {})()).name == "mine"
+
+
 class Quiet(Lattice):
     """Does not call what it is derived from."""
 

@@ -44,7 +44,7 @@ class RewardWatch:
             self._has_ended |= dones
             if self._has_ended.all() and self._n_steps.max() > 1 and self._least > max(self._threshold, 0.0):
                 self._warn("Each step", self._least, "about 0, unless the task is solved from the first step on")
-            if (lowest := (self._sum[dones] / self._n_steps[dones]).min()) < -self._threshold:
+            if (lowest := (self._sum[dones] / self._n_steps[dones]).min()) < -abs(self._threshold):
                 self._warn("On average, the steps of an episode", lowest, f"about 0, and a success up to {self._worth:.2g}")
             self._sum[dones] = self._n_steps[dones] = 0
 

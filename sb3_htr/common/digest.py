@@ -31,8 +31,8 @@ def digest_of_code(modules: Iterable[str]) -> str:
     for module in modules:
         outermost = sys.modules[module.partition(".")[0]]
         folders = [Path(folder) for folder in getattr(outermost, "__path__", ())]
-        inside = [file for folder in folders for file in sorted(folder.rglob("*")) if file.is_file()]
-        files += [file for file in inside if file.suffix != ".pyc"] if folders else [Path(outermost.__file__ or "")]
+        inside = [file for folder in folders for file in sorted(folder.rglob("*")) if file.parent.name != "__pycache__"]
+        files += [file for file in inside if file.is_file()] if folders else [Path(outermost.__file__ or "")]
     return sha256(*files)
 
 

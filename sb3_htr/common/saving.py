@@ -19,6 +19,9 @@ from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.errors import last_line
 from sb3_htr.common.settings import check_keywords, check_mappings, keywords_of
 
+# What SB3's models have in place of the setting ``policy``
+POLICY = "policy_class"
+
 
 @contextmanager
 def _settings_are_read(path: object, names: Iterable[str]) -> Iterator[None]:
@@ -28,10 +31,13 @@ def _settings_are_read(path: object, names: Iterable[str]) -> Iterator[None]:
         try:
             yield
         except UserWarning as error:
+            if not str(error).startswith("Could not deserialize object"):  # where all warnings are errors
+                raise
             name = str(error).split(". ")[0].split()[-1]
+            given = f"custom_objects={{{name!r}: ...}}" if name == POLICY else f"{name}=..."
             raise ValueError(
                 f"{path} has a {name} that cannot be read, as it is of another version of some package "
-                f"({last_line(error)}): give all of it, as {name}=..., or load it by that version."
+                f"({last_line(error)}): give all of it, as {given}, or load it by that version."
             ) from error
 
 
@@ -126,7 +132,7 @@ class CheckedFiles(BaseAlgorithm):
             if "replay_buffer_kwargs" in kwargs:
                 of_both = (theirs.get("replay_buffer_kwargs"), kwargs["replay_buffer_kwargs"])
                 kwargs["replay_buffer_kwargs"] = {name: x for given in of_both for name, x in (given or {}).items()}
-        with _settings_are_read(path, keywords_of(cls) - kwargs.keys()):
+        with _settings_are_read(path, {POLICY, *keywords_of(cls)} - kwargs.keys()):
             model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         state = vars(model)
         if "ent_coef_tensor" in state:  # SB3 has put that of the file in the place of one that was given

@@ -9,7 +9,6 @@ from contextlib import closing, contextmanager
 from itertools import count
 from multiprocessing.process import BaseProcess
 from multiprocessing.util import Finalize
-from pathlib import Path
 from typing import Any, cast
 
 import gymnasium as gym
@@ -220,13 +219,24 @@ def make_task_vec_env(
     monitored = TaskVecMonitor(venv, info_keywords=("is_success",) if tells_rewards(family) else ())
     if monitor_dir is not None:
         header: dict[str, Any] = {"t_start": monitored.t_start, "env_id": env_id}
+        os.makedirs(monitor_dir, exist_ok=True)
         # A run that goes on has those of before, too
-        name = next(name for name in map(str, count()) if not Path(monitor_dir, f"{name}.monitor.csv").exists())
-        monitored.results_writer = PatientResultsWriter(os.path.join(monitor_dir, name), header, monitored.info_keywords)
+        paths = (os.path.join(monitor_dir, f"{number}.monitor.csv") for number in count())
+        path = next(path for path in paths if _is_made(path))
+        monitored.results_writer = PatientResultsWriter(path, header, monitored.info_keywords)
     # Without one, SB3 would draw it from numpy's global generator
     if seed is not None:
         monitored.seed(seed)
     return monitored
+
+
+def _is_made(path: str) -> bool:
+    """Whether the file was not there: of processes that begin at once, it is one's alone."""
+    try:
+        open(path, "x").close()
+    except FileExistsError:
+        return False
+    return True
 
 
 @contextmanager

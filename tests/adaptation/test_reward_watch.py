@@ -12,6 +12,7 @@ from helpers import ENV_ID
 from helpers.runs import SHIPPED
 from sb3_htr import PEARL
 from sb3_htr.adaptation import Step
+from sb3_htr.adaptation.reward_watch import RewardWatch
 
 
 @pytest.mark.parametrize(
@@ -46,6 +47,13 @@ def test_ends_of_episodes_may_be_numbers() -> None:
     obs = np.zeros((3, 2), dtype=np.float32)
     with pytest.warns(UserWarning, match="On average, the steps of an episode returned -1"):
         adaptation.observe(Step(obs, obs, np.array([0.0, 0.0, -1.0]), obs, np.array([0, 0, 1])))
+
+
+def test_steps_that_return_what_they_should_are_not_warned_of_where_a_success_may_be_below_0() -> None:
+    """As where a step without success is -1, and the model of task-free rewards has not learnt it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        RewardWatch(2, threshold=-0.5, worth=0.5).check(np.array([0.0, 0.0]), np.array([True, False]))
 
 
 def test_rewards_that_no_network_could_take_are_refused() -> None:

@@ -17,6 +17,7 @@ from helpers import ENV_ID
 from htr_envs import DynamicsVectorEnv, PointRobotFamily, PointRobotVectorEnv, Trajectory
 from htr_envs.point_robot import PointRobotDynamics
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
+from sb3_htr.common.vec_wrappers import PatientResultsWriter
 
 
 def test_an_id_can_name_the_module_that_registers_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -229,3 +230,17 @@ def test_a_folder_of_episodes_keeps_those_of_before(tmp_path: Path) -> None:
     make_task_vec_env(ENV_ID, 1, monitor_dir=str(tmp_path)).close()
     assert sorted(path.name for path in tmp_path.iterdir()) == [f"{i}.monitor.csv" for i in range(3)]
     assert (tmp_path / "1.monitor.csv").read_text() == before
+
+
+def test_trainings_that_begin_at_once_in_one_folder_have_files_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def begin(*args: Any) -> PatientResultsWriter:
+        """While another one begins."""
+        monkeypatch.undo()
+        make_task_vec_env(ENV_ID, 1, monitor_dir=str(tmp_path)).close()
+        return PatientResultsWriter(*args)
+
+    monkeypatch.setattr("sb3_htr.common.vec_env.PatientResultsWriter", begin)
+    make_task_vec_env(ENV_ID, 1, monitor_dir=str(tmp_path)).close()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["0.monitor.csv", "1.monitor.csv"]

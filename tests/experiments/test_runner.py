@@ -530,3 +530,7 @@ def test_the_digest_of_code_is_of_all_that_it_may_need(tmp_path: Path, monkeypat
         (tmp_path / name).write_text(text)
         seen.append((digest_of_code(["digested.one"]), digest_of_code(["digested_alone"])))
     assert len({of_package for of_package, _ in seen}) == 3 and len({alone for _, alone in seen}) == 2
+    (tmp_path / "digested" / "__pycache__").mkdir(exist_ok=True)
+    for name in ("three.cpython-311.pyc", "three.cpython-311.pyc.140223"):  # another process imports it, and will rename it
+        (tmp_path / "digested" / "__pycache__" / name).write_text(name)
+    assert digest_of_code(["digested.one"]) == seen[-1][0]

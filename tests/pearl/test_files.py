@@ -27,7 +27,7 @@ from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.save_util import data_to_json, load_from_zip_file
 from stable_baselines3.common.utils import LinearSchedule
 
-from helpers import ENV_ID, ROLLOUT, MakePEARL, many, parameters, with_policy
+from helpers import ENV_ID, ROLLOUT, TINY, MakePEARL, many, parameters, with_policy
 from helpers.bombs import Bomb, bombs
 from sb3_htr import PEARL, AdaptedAgent, evaluate_adaptation, load_untrusted
 from sb3_htr.adaptation import Aggregate, Belief, Prior
@@ -556,3 +556,21 @@ def test_a_setting_that_cannot_be_read_is_not_the_default(
     with pytest.warns(UserWarning, match="Could not deserialize object replay_buffer_kwargs"):
         model = PEARL.load(tmp_path / "model", replay_buffer_kwargs=given)
     assert model.replay_buffer_kwargs == given
+
+
+def test_a_policy_that_cannot_be_read_is_said(tmp_path: Path, tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch) -> None:
+    gone = type("Gone", (PEARLPolicy,), {"__module__": "sb3_htr.pearl.policies", "__qualname__": "Gone"})
+    with monkeypatch.context() as patch:
+        patch.setattr("sb3_htr.pearl.policies.Gone", gone, raising=False)
+        PEARL(gone, ENV_ID, **TINY).save(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"a policy_class that cannot be read.* as custom_objects={'policy_class': \.\.\.}"):
+        PEARL.load(tmp_path / "model")
+    assert type(PEARL.load(tmp_path / "model", custom_objects={"policy_class": PEARLPolicy}).policy) is PEARLPolicy
+
+
+def test_warnings_that_are_errors_are_told_as_what_they_are(tmp_path: Path, tiny_pearl: MakePEARL) -> None:
+    tiny_pearl().save(tmp_path / "model")
+    env = make_task_vec_env(ENV_ID, 64)
+    with warnings.catch_warnings(), pytest.raises(UserWarning, match="A rollout is of 64 tasks"):
+        warnings.simplefilter("error")
+        PEARL.load(tmp_path / "model", env)

@@ -32,7 +32,8 @@ class LearnedPrior(FixedExploration, ParticleExplorer):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_numbers(hindsight_share=(self.hindsight_share, 0.0, 1.0))
-        self.name = "learned-prior"
+        if type(self) is LearnedPrior:  # a class of one's own has its own name
+            self.name = "learned-prior"
 
     def start(self) -> None:
         super().start()

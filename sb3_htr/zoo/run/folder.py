@@ -27,13 +27,16 @@ def claim(log_folder: str, stem: str, suffix: str) -> Path:
     :param suffix: behind the number of the run
     :return: a new folder, ``<stem>_<number><suffix>``, that no other process has, however many begin at once
     """
-    os.makedirs(log_folder, exist_ok=True)
-    number = max((run_number(path, stem) for path in Path(log_folder).iterdir() if path.name.startswith(stem)), default=0)
+    try:
+        names = os.listdir(log_folder)
+    except FileNotFoundError:  # or another process, whose training was refused, has just removed it
+        names = []
+    number = max((run_number(Path(name), stem) for name in names if name.startswith(stem)), default=0)
     while True:
         number += 1
         folder = Path(log_folder, f"{stem}_{number}{suffix}")
         try:
-            folder.mkdir(parents=True)  # another process, which was refused, may have removed those above
+            folder.mkdir(parents=True)
         except FileExistsError:
             continue
         return folder

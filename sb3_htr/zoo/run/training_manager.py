@@ -86,13 +86,14 @@ class TrainingManager(MetaExperimentManager):
         try:
             return super().setup_experiment()
         except BaseException as error:
+            if self._lock is not None:
+                self._lock.release()
             if self._claimed is not None:  # nothing was trained in it
-                shutil.rmtree(self._claimed)
+                # Why it is refused matters more than a folder that NFS keeps, as a file in it is still open
+                shutil.rmtree(self._claimed, ignore_errors=True)
             for folder in self._made:
                 with contextlib.suppress(OSError):  # others may be in it
                     folder.rmdir()
-            if self._lock is not None:
-                self._lock.release()
             if isinstance(error, OSError) and error.filename is None and error.errno == errno.ENOSPC:
                 raise OSError(error.errno, error.strerror, self.save_path) from error
             raise
