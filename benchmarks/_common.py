@@ -23,8 +23,6 @@ from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.common.versions import commit, hardware, named
 from sb3_htr.htr import MultiTaskReplayBuffer
 
-# As sb3-htr train does
-
 ENV_ID = "SparsePointRobot-v0"
 RESULTS = Path(__file__).parent / "results"
 # What figures depend on, as git names it: not the figures themselves

@@ -7,6 +7,7 @@ from concurrent.futures import Executor
 from importlib.util import find_spec
 from pathlib import Path
 
+import torch as th
 from _common import ENV_ID, Figure, write
 
 from sb3_htr.experiments.driver import Driver
@@ -50,6 +51,7 @@ def main() -> None:
     """One thread for each cell."""
     if find_spec("ray") is None:
         return print("Not measured: it needs Ray, pip install '.[ray]'.")
+    th.set_num_threads(1)  # as in the cells
     nodes, serial, processes = on_two_nodes(), cells_per_minute(Processes(1)), cells_per_minute(Processes(2))
     name = f"{N_CELLS} cells of {N_TIMESTEPS:,} env steps, two nodes"
     alternatives = {"one after the other": (serial, 1.9), "two processes of this machine, without Ray": (processes, None)}

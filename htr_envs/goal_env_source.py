@@ -57,7 +57,8 @@ class GoalEnvSource:
         spec.kwargs.update(env_kwargs)
         with np.printoptions(threshold=sys.maxsize, floatmode="unique"):  # arrays in full, as they tell sources apart
             arguments = ", ".join(f"{key}={value!r}" for key, value in sorted(spec.kwargs.items()))
-        return cls(f"{spec.id}({arguments})", spec, spec.entry_point)
+            wrappers = f" in {spec.additional_wrappers!r}" if spec.additional_wrappers else ""
+        return cls(f"{spec.id}({arguments}){wrappers}", spec, spec.entry_point)
 
     @lru_cache(maxsize=16)  # noqa: B019 sources are few; a copy may have objects of another address, and be another source
     def dense(self) -> GoalEnvSource | None:
@@ -278,6 +279,11 @@ def _failure_reward(source: GoalEnvSource, goals: FloatArray) -> float:
     others = np.roll(goals, 1, axis=0)
     found = np.unique(np.stack([goal_rewards(source, goals + np.float32(t) * (others - goals), goals) for t in WAY]))
     success = np.unique(goal_rewards(source, goals, goals))
+    if len(np.union1d(found, success)) == 1:
+        raise ValueError(
+            f"compute_reward of {source.spec.id} gives {success[0]:.3g} at each goal for each other one: the goals that it "
+            "draws lie so near to one another that all are reached at once, or its reward tells of no goal."
+        )
     if len(success) != 1 or not np.array_equal(np.union1d(found, success), success[0] - np.array([1.0, 0.0])):
         shown = ", ".join(f"{value:.3g}" for value in np.union1d(found, success)[:5])
         raise ValueError(f"compute_reward of {source.spec.id} gives {shown} ..., {SPARSE_ONLY}")

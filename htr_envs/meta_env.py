@@ -43,7 +43,9 @@ class TaskDistribution(ABC):
     ) -> None:
         if not isinstance(task_space, spaces.Box) or len(task_space.shape) != 1:
             raise ValueError(f"task_space is {task_space}, expected a Box of one axis, shape (task_dim,): tasks are vectors.")
-        self.task_space = task_space
+        # Tasks are float32, and one on a bound must not fall out by rounding
+        low, high = task_space.low.astype(np.float32), task_space.high.astype(np.float32)
+        self.task_space = spaces.Box(low, high, dtype=np.float32)
         self.train_tasks = _float_array("train_tasks", train_tasks)
         self.validation_tasks = _float_array("validation_tasks", validation_tasks)
         self.test_tasks = _float_array("test_tasks", test_tasks)
@@ -58,7 +60,7 @@ class TaskDistribution(ABC):
                 )
             if not np.isfinite(tasks).all():
                 raise ValueError(f"{name} has NaN or infinity, expected finite numbers.")
-            if not all(task_space.contains(task) for task in tasks):
+            if not all(self.task_space.contains(task) for task in tasks):
                 raise ValueError(f"{name} holds a task that is not in {task_space}: widen the space or move it.")
             # adding 0.0 turns -0.0 into 0.0, the same task with other bytes
             keys = {(task + 0.0).tobytes() for task in tasks}

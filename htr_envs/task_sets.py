@@ -64,11 +64,13 @@ def draw_task_sets(
 
     def draw(n: int, purpose: int, others: NDArray[np.float64]) -> NDArray[np.float64]:
         random_state = np.random.RandomState([task_seed, purpose])
-        part, values = np.arange(n), np.zeros(n)
+        part, values, others = np.arange(n), np.zeros(n), np.sort(others)
         for _ in range(MAX_DRAWS):
             values[part] = low + (high - low) * (part + random_state.uniform(size=len(part))) / n
             # In float32, two of them may be one task
-            part = np.flatnonzero(np.abs(values[:, None] - others).min(axis=1) < NEAREST)
+            above = np.searchsorted(others, values)
+            neighbours = others[np.stack([np.maximum(above - 1, 0), np.minimum(above, len(others) - 1)])]
+            part = np.flatnonzero(np.abs(values - neighbours).min(axis=0) < NEAREST)
             if len(part) == 0:
                 break
         random_state.shuffle(values)

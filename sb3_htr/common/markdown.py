@@ -9,4 +9,5 @@ def markdown_table(head: Sequence[str], body: Iterable[Sequence[str]]) -> str:
     :param body: cells of each line below
     :return: the table, without a line break at its end
     """
-    return "\n".join("| " + " | ".join(line) + " |" for line in (head, ["---"] * len(head), *body))
+    lines = (head, ["---"] * len(head), *body)
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)

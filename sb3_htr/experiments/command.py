@@ -136,6 +136,8 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     check_numbers(**{name: (n, 1) for name, n in given.items() if n is not None})
     if not args.ray:  # whose nodes may have others
         check_device(args.device)
+    elif ":" in args.device:
+        raise ValueError(f"--device is {args.device}, but Ray chooses which GPU a run sees: give --device cuda.")
     return args
 
 

@@ -50,7 +50,8 @@ def n_seeds(results: Results) -> int:
 def _title(results: Results) -> str:
     n = n_seeds(results)
     # The IQM of three is their mean
-    shown = "one seed" if n == 1 else f"{'mean' if n < 4 else 'IQM'} over {n} seeds, 95 % interval"
+    interval = "95 % interval" + " (of learning curves, the range)" * (n < 4)
+    shown = "one seed" if n == 1 else f"{'mean' if n < 4 else 'IQM'} over {n} seeds, {interval}"
     return f"{next(iter(results)).env_id}: {shown}"
 
 
@@ -185,7 +186,8 @@ def goal_distance(results: Results, path: Path) -> None:
             if axes is left:
                 values = values / np.array(optimum)[:, None, None]
             # (n_seeds, n_eval_seeds, n_tasks, n_distances)
-            band(axes, np.array(x), np.stack(np.split(values, len(x)), axis=-1), colour, "-", variant)
+            name = label(variant, ordered[: len(ordered) // len(x)], results)
+            band(axes, np.array(x), np.stack(np.split(values, len(x)), axis=-1), colour, "-", name)
     left.axhline(1, color=GREY, linestyle=":", linewidth=1)
     left.set_ylabel("return of the last episode / optimum")
     right.set_ylabel("test tasks solved in the last episode")
@@ -211,7 +213,8 @@ def relabelling(results: Results, path: Path) -> None:
     n = min(map(len, returns), default=0)
     if n:
         heights = np.stack([values[:n] for values in returns], axis=-1)
-        band(left, np.array(probabilities), heights, BLUE, "-", "IQM and 95 % interval")
+        seeds = f" (seeds: {n})" * (n < n_seeds(results))
+        band(left, np.array(probabilities), heights, BLUE, "-", f"IQM and 95 % interval{seeds}")
     for k, values in zip(probabilities, returns, strict=True):
         text = "one seed" if k == 0 else None
         left.plot([k] * len(values), values.mean(axis=(1, 2)), "o", color=GREY, markersize=3, label=text)

@@ -115,7 +115,10 @@ def check_none_lost(folder: Path, cells: Sequence[Cell]) -> None:
     :param folder: of results, about to be written
     :param cells: that they are of
     :raises ValueError: if it has runs of others, or others of the same names, which would be lost; or damaged files
+    :raises NotADirectoryError: if it is a file
     """
+    if folder.is_file():
+        raise NotADirectoryError(f"{folder} is a file, expected a folder for the results: name another one with -o.")
     by_name = {cell.name: cell for cell in cells}
     advice = "name another folder with -o, or move this one away."
     lost = set()

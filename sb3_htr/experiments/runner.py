@@ -3,6 +3,7 @@
 import json
 import platform
 import shutil
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, cast
 
@@ -31,6 +32,7 @@ from sb3_htr.zoo.run.record import RECORD, read_record
 from sb3_htr.zoo.run.shipped import block_of
 from sb3_htr.zoo.run.train_arguments import training_facts
 from sb3_htr.zoo.run.trust import import_packages, plain_settings
+from sb3_htr.zoo.run.yaml_checks import checked_kinds
 
 # Means over the training of what HTR paper, B.2 reasons with
 LOGGED = ("relabelled_fraction", "rl_reward_mean", "rl_zero_reward_fraction")
@@ -178,7 +180,11 @@ def hyperparams_of(cell: Cell) -> dict[str, Any]:
     :return: hyperparameters that it is trained with, as its record will have them
     """
     method = get_method(cell.method)
-    of_env = block_of(method.algorithm.settings, cell.env_id)
+    file = method.algorithm.settings
+    of_env = block_of(file, cell.env_id)
+    with suppress(ValueError):  # code stays text
+        of_env = plain_settings(of_env, file, trust=False, named=cell.gym_packages)
+    of_env = checked_kinds(of_env, file)
     used = {**merged(method.settings(of_env), cell.settings), "n_timesteps": cell.n_timesteps}
     return cast(dict[str, Any], json.loads(json.dumps(used, default=str)))  # which knows no tuples
 
@@ -200,6 +206,11 @@ def _planned(cell: Cell) -> dict[str, Any]:
 
 def _check_loadable(cell: Cell) -> None:
     """Before it is trained: its model will be loaded as those of strangers are."""
+    if env_kwargs := hyperparams_of(cell).get("env_kwargs"):
+        raise ValueError(
+            f"{cell.label} would be trained with env_kwargs {env_kwargs} of {get_method(cell.method).algorithm.settings}, and "
+            "evaluated without: give them to the Variant in its place."
+        )
     try:
         hyperparams = plain_settings(hyperparams_of(cell), cell.label, trust=False)
     except ValueError:  # code, as rl_zoo3 takes it: what it makes is known when it has been run

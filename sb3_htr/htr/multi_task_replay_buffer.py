@@ -379,7 +379,8 @@ class MultiTaskReplayBuffer(ReplayBuffer):
             store = hindsight.store
             if hindsight.elsewhere:
                 self._draw_elsewhere(virtual[rl], of_store[rl], hindsight.elsewhere)
-        # From here on, n_steps rows for each of the RL batch
+        # From here on, n_steps rows for each of the RL batch; no episode has more than its time limit
+        n_steps = min(n_steps, self.max_episode_steps)
         ahead, n_ahead = self._steps_ahead(virtual[rl], of_store[rl], store, n_steps)
         times = np.repeat([1, n_steps], [len(context), len(batch)])
         of_task = np.repeat(task_of_row, times)

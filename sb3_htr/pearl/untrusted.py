@@ -5,6 +5,7 @@ import re
 import warnings
 from typing import Any
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import GymEnv
@@ -184,7 +185,10 @@ def _schedule(learning_rate: Any) -> dict[str, LinearSchedule]:
     numbers = [learning_rate[name] for name in ("start", "end", "end_fraction")]
     if not all(type(number) in (int, float) for number in numbers):
         raise TypeError
-    return {"learning_rate": LinearSchedule(*numbers)}
+    schedule = LinearSchedule(*numbers)
+    if not all(np.isfinite(schedule(remaining)) for remaining in (1.0, 0.0)):
+        raise ValueError
+    return {"learning_rate": schedule}
 
 
 def _check_memory(settings: dict[str, Any]) -> None:

@@ -29,7 +29,7 @@ from sb3_htr.experiments.evaluation_cache import FOLDER
 from sb3_htr.experiments.executors import SerialExecutor
 from sb3_htr.experiments.grid import Experiment, Variant, by
 from sb3_htr.experiments.protocol import evaluate
-from sb3_htr.experiments.runner import find_finished, run_cell
+from sb3_htr.experiments.runner import find_finished, hyperparams_of, run_cell
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.commands import train
 from sb3_htr.zoo.run.agents import agent_at
@@ -336,6 +336,18 @@ def test_settings_that_could_not_be_evaluated_are_not_trained_with(tmp_path: Pat
             run_cell(cell, tmp_path)
 
 
+def test_a_file_of_settings_is_read_as_a_training_reads_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else the run would be another one than the cell's, when it has been trained."""
+    block: dict[str, Any] = {"policy": "MlpPolicy", "policy_kwargs": "{'latent_dim': 3}", "replay_buffer_kwargs": None}
+    monkeypatch.setattr("sb3_htr.experiments.runner.block_of", lambda *_: dict(block))
+    (cell,) = Experiment("one", "", ENV_ID, 480, (Variant("htr-ser"),), 1).cells()
+    assert hyperparams_of(cell)["policy_kwargs"] == {"latent_dim": 3}
+    assert "relabeller" in hyperparams_of(cell)["replay_buffer_kwargs"]
+    block["env_kwargs"] = {"goal_distance": 0.8}
+    with pytest.raises(ValueError, match=r"htr-ser.* would be trained with env_kwargs .*: give them to the Variant"):
+        run_cell(cell, tmp_path)
+
+
 @pytest.mark.parametrize(
     "settings",
     [
@@ -514,6 +526,14 @@ def test_runs_are_on_the_cpu_unless_a_device_is_given(
 def test_a_device_that_there_is_not_is_refused() -> None:
     with pytest.raises(ValueError, match="The device 'gpu' cannot be used: give cpu, cuda or cuda:N"):
         main(["experiment", "point_robot", "--device", "gpu"])
+    with pytest.raises(ValueError, match="--device is cuda:1, but Ray chooses which GPU a run sees: give --device cuda"):
+        main(["experiment", "point_robot", "--ray", "auto", "--device", "cuda:1"])
+
+
+def test_results_that_could_not_be_written_are_not_trained_for(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(NotADirectoryError, match="file is a file, expected a folder for the results"):
+        main(["experiment", "point_robot", "--runs", str(tmp_path / "runs"), "-o", str(tmp_path / "file")])
 
 
 def test_the_digest_of_code_is_of_all_that_it_may_need(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

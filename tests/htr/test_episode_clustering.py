@@ -25,6 +25,11 @@ def filled(
     return buffer, buffer.relabeller
 
 
+def test_a_width_that_is_no_float_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"cell_size is \[1000.*0\], expected positive widths"):
+        EpisodeClustering([10**400])
+
+
 @given(st.lists(st.tuples(st.floats(-5, 5), st.floats(-5, 5)), min_size=1), st.floats(0.01, 2))
 def test_grid_maps_tasks_to_the_middle_of_their_cell(tasks: list[tuple[float, float]], cell_size: float) -> None:
     points = np.array(tasks, dtype=np.float32)

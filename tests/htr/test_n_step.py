@@ -38,6 +38,12 @@ def test_a_return_has_the_rewards_of_the_hindsight_task(seed: int, n_steps: int,
                 np.testing.assert_allclose(value, wanted, rtol=1e-5, atol=1e-6)
 
 
+def test_no_return_is_longer_than_an_episode() -> None:
+    """A number that asks for all of it takes no more memory than that."""
+    whole, more = (filled(lengths=LENGTHS, seed=0).sample(8, meta_batch_size=8, n_steps=n, gamma=0.9) for n in (20, 10**9))
+    np.testing.assert_array_equal(whole.rewards, more.rewards)
+
+
 def in_order(obs: np.ndarray, action: np.ndarray) -> list[int]:
     """Of the steps of a walk from the origin."""
     steps = [int(np.flatnonzero((obs == 0).all(axis=1))[0])]

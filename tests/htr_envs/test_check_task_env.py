@@ -352,6 +352,16 @@ def test_tasks_that_are_none_are_named(space: Any, train_tasks: Any, sentence: s
         Family()
 
 
+def test_a_task_on_the_bound_of_a_space_of_float64_is_in_it() -> None:
+    """Though it is float32, which rounds .1 up."""
+
+    class Family(LineFamily):
+        def __init__(self) -> None:
+            super(LineFamily, self).__init__(spaces.Box(-0.1, 0.1, (1,), np.float64), [[-0.1], [0.1]], [[0.05]], [[-0.05]])
+
+    assert Family().task_vectors([0.1], (1,)) == np.float32(0.1)
+
+
 def test_hooks_that_return_nothing_are_named() -> None:
     class NoReturn(LineEnv):
         def _step_state(self, action: Any) -> Any:

@@ -236,6 +236,15 @@ def test_an_id_that_is_registered_again_is_another_family() -> None:
     assert not near and far
 
 
+def test_wrappers_of_a_registration_are_part_of_it() -> None:
+    """Envs are kept to be asked, of each source one."""
+    plain = HiddenGoalEnv(TOY)
+    wrapped = gym.wrappers.RescaleAction(gym.make(TOY), np.float32(-10), np.float32(10))
+    assert wrapped.spec is not None
+    scaled = HiddenGoalEnv(wrapped.spec)
+    assert (scaled.action_space.high == 10).all() and (plain.action_space.high == 1).all()
+
+
 def test_families_of_long_arguments_are_told_apart() -> None:
     """numpy leaves out most of an array of more than a thousand numbers."""
     near = np.random.default_rng(0).uniform(-1, 1, (600, 2))
@@ -388,7 +397,7 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     (CHOICE, {"reward_type": "ten"}, "gives 0, 10 ..., but a sparse reward"),
     (CHOICE, {"reward_type": "shaped"}, "choose it by an argument of the env, such as reward_type='sparse'"),
     (CHOICE, {"reward_type": "upside_down"}, "the larger one at the goal"),
-    (CHOICE, {"reward_type": "free"}, "gives 0 ..., but a sparse reward"),
+    (CHOICE, {"reward_type": "free"}, "gives 0 at each goal for each other one"),
     (CHOICE, {"reward_type": "one goal at a time"}, "let it take many goals at once, as HER does"),
     (TOY, {"n_goals": 9}, "drew only 9 different goals"),
     ("ToyUnseededEnv-v0", {}, "draws another goal for the same seed"),

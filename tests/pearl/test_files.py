@@ -210,6 +210,17 @@ def test_garbage_is_refused(tmp_path_factory: pytest.TempPathFactory, garbage: b
         load_untrusted(file, ENV_ID)
 
 
+@pytest.mark.parametrize("numbers", [{"end_fraction": 0}, {"start": 10**400}, {"end": float("inf")}])
+def test_a_schedule_without_numbers_is_refused(numbers: dict[str, float], tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    tiny_pearl(learning_rate=LinearSchedule(0.1, 0.0, 1.0)).save(tmp_path / "model.zip")
+    with zipfile.ZipFile(tmp_path / "model.zip") as archive:
+        data = json.loads(archive.read("data"))
+    data["learning_rate"] |= numbers
+    repack(tmp_path / "model.zip", tmp_path / "crafted.zip", {"data": json.dumps(data).encode()})
+    with pytest.raises(ValueError, match=r"crafted\.zip is damaged"):
+        load_untrusted(tmp_path / "crafted.zip", ENV_ID)
+
+
 @pytest.mark.parametrize("part", [0.0, 0.3, 0.9, 0.999])
 def test_truncated_files_are_refused(tiny_pearl: MakePEARL, tmp_path: Path, part: float) -> None:
     model = tiny_pearl().learn(ROLLOUT)

@@ -119,15 +119,16 @@ def test_curves_say_what_they_show(drawn: list[Figure], monkeypatch: pytest.Monk
     for n_seeds, n_points, said in (
         (1, 21, "env"),
         (2, 15, "env; mean and range of 2 seeds"),
-        (3, 15, "env; mean of 3 seeds, 95 % interval"),
+        (3, 15, "env; mean and range of 3 seeds"),
         (4, 2, "env; IQM over seeds, 95 % interval"),
     ):
         zeros = np.zeros((n_seeds, n_points))
-        plots_of = {"a": curves.Curve(np.arange(n_points), zeros, zeros, "htr-ser")}
+        plots_of = {"_a": curves.Curve(np.arange(n_points), zeros, zeros, "htr-ser")}
         curves.plot_curves(plots_of, Path("x.png"), "env", "x", "return")
         left, right = drawn[-1].axes
         assert [axes.get_ylabel() for axes in (left, right)] == ["return", "share of tasks solved (%)"]
         assert drawn[-1].get_suptitle() == said
+        assert left.get_legend_handles_labels()[1], "whatever a folder is called"
         line: Any = left.lines[0]
         assert line.get_marker() == "o" and n_points / line.get_markevery() <= 12
         assert left.get_ylim()[1] >= 1 and left.get_ylim()[0] < 0, "zeros are no noise"
@@ -154,6 +155,7 @@ def test_a_method_has_one_colour_in_all_pictures() -> None:
         assert again == own != other
         first, second = curve_styles([name, name])
         assert first == own != second, "two settings of one method are told apart"
+    assert len(curve_styles([f"mine {i}" for i in range(99)])) == 99
 
 
 def test_where_lines_tell_something_else_no_two_methods_have_one_colour() -> None:

@@ -393,6 +393,10 @@ def test_extra_arguments_are_refused(unbroken: Path, tmp_path: Path) -> None:
         main(["train", "--resume", str(run), "--seed", "5"])
     with pytest.raises(ValueError, match=r"own arguments: leave --method out"):
         main(["train", "--resume", str(run), "--method", "htr-ec"])
+    with pytest.raises(ValueError, match=r"own arguments: leave --algo out"):
+        main(["train", "--resume", str(run), "--algo", "rl2"])
+    with pytest.raises(ValueError, match="-n is -240, expected"):
+        main(["train", "--resume", str(run), "-n", "-240"])
 
 
 def test_a_run_that_goes_on_with_other_code_says_so(unbroken: Path, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch as th
+from PIL import Image, ImageSequence
 
 from helpers import ENV_ID, MakePEARL
 from helpers.disks import disk
@@ -211,6 +212,18 @@ def test_pictures_of_a_film_are_of_one_size(suffix: str, tmp_path: Path) -> None
     with pytest.raises(ValueError, match="A picture of the film has 40 x 60 pixels, expected 60 x 40 as the first one"):
         film.add(np.zeros((60, 40, 3), dtype=np.uint8), 0.0)
     film.close()
+
+
+@pytest.mark.parametrize("fps", [15, 22.5, 30, 35, 45])
+def test_a_gif_is_as_long_as_was_asked_for(fps: float, tmp_path: Path) -> None:
+    """Though it counts hundredths of a second."""
+    film = Film(tmp_path / "film.gif", fps)
+    for i in range(20):
+        film.add(np.full((8, 8, 3), 12 * i, dtype=np.uint8), 0.0)
+    film.close()
+    with Image.open(film.path) as gif:
+        durations = [frame.info["duration"] for frame in ImageSequence.Iterator(gif)]
+    assert sum(durations) == pytest.approx(1000 * sum(film.seconds), abs=10) and min(durations) >= 20
 
 
 def test_a_film_on_a_full_disk_is_no_film(tmp_path: Path, tiny_pearl: MakePEARL, capfd: pytest.CaptureFixture[str]) -> None:

@@ -19,7 +19,7 @@ from stable_baselines3.common.callbacks import EvalCallback
 
 import sb3_htr
 from helpers import ENV_ID, TINY
-from helpers.runs import run_folder, train_arguments
+from helpers.runs import SHIPPED, run_folder, train_arguments
 from sb3_htr import PEARL
 from sb3_htr.adaptation.evaluation import AdaptationRecord
 from sb3_htr.common.divergence import DivergedError
@@ -93,6 +93,15 @@ def test_evaluations_of_one_run_do_not_replace_each_other(runs: Path, tmp_path: 
     names = {path.stem for path in tmp_path.glob("*.npz")}
     assert names == {f"adaptation{of}" for of in ("", "-validation", "-prior", "-last", "-last-train")}
     assert len(list(tmp_path.glob("*.png"))) == 2 * len(of)
+
+
+def test_an_evaluation_is_named_after_the_model_that_a_file_is(runs: Path, tmp_path: Path) -> None:
+    run = run_folder(runs)
+    for file, arguments in (("best_model.zip", ["--model", "last"]), (f"{ENV_ID}.zip", [])):
+        assert main(["evaluate", str(run / file), "-o", str(tmp_path), "--n-episodes", "1", *arguments]) == 0
+    assert {path.stem for path in tmp_path.glob("*.npz")} == {"adaptation", "adaptation-last"}
+    assert main(["evaluate", str(SHIPPED), "-o", str(tmp_path / "shipped"), "--n-episodes", "1", "--model", "last"]) == 0
+    assert [path.stem for path in (tmp_path / "shipped").glob("*.npz")] == ["adaptation"]
 
 
 def test_a_model_is_trained_on(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:

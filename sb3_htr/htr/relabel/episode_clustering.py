@@ -51,7 +51,7 @@ class EpisodeClustering(HindsightBuffers):
         check_flags(prefer_unsolved=prefer_unsolved)
         try:
             self.cell_size = np.asarray(cell_size, dtype=np.float32)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise ValueError(f"cell_size is {cell_size!r}, expected positive widths.") from None
         if not ((self.cell_size > 0) & np.isfinite(self.cell_size)).all() or self.cell_size.size == 0:
             raise ValueError(f"cell_size is {self.cell_size.tolist()}, expected positive widths.")

@@ -50,7 +50,12 @@ def main(argv: Sequence[str]) -> None:
     explorer = args.explorer or model.explorer.name
     output = args.output or agent.folder or Path(agent.stem)
     # What is not by default is in the names, or one evaluation of a run would replace another
-    choices = {args.model: parser.get_default("model"), args.tasks: parser.get_default("tasks"), explorer: model.explorer.name}
+    is_last = agent.folder is not None and agent.path.name != "best_model.zip"
+    choices = {
+        "last" if is_last else "best": parser.get_default("model"),
+        args.tasks: parser.get_default("tasks"),
+        explorer: model.explorer.name,
+    }
     which = "".join(f"-{choice}" for choice, default in choices.items() if choice != default)
     # Around all, as what cannot be written should be known before the work
     with atomic_path(output / f"adaptation{which}.npz") as path:

@@ -78,7 +78,7 @@ def main(argv: Sequence[str]) -> None:
         raise ValueError(
             "--storage needs a --study-name, by which other workers and `sb3-htr train --trial-id` find the study."
         )
-    study = create_study(args.storage, args.study_name) if args.storage else None
+    study = create_study(args.storage, args.study_name) if args.storage and args.env else None  # which is asked for below
     # It was said above whether the study is new; to rl_zoo3 it never is
     logger = logging.getLogger("optuna.study.study")
     logger.addFilter(_is_news)

@@ -11,6 +11,7 @@ import gymnasium as gym
 
 from htr_envs.goal_env import NAMESPACE, find_hidden
 from sb3_htr.common.checkpoint import n_steps_done
+from sb3_htr.common.settings import check_numbers
 from sb3_htr.zoo.run.agents import find_runs, is_finished, n_steps_of
 from sb3_htr.zoo.run.method import DEFAULT, get_method, methods
 from sb3_htr.zoo.run.record import OF_TRAINING, RECORD, arguments_to_go_on, command_to_go_on, read_record
@@ -64,7 +65,7 @@ def main(argv: Sequence[str]) -> None:
     # Before anything else: they may bring the method, too
     import_packages(args.gym_packages)
     algorithm = get_method(args.method or DEFAULT).algorithm
-    if args.algo not in (None, algorithm.name):
+    if args.resume is None and args.algo not in (None, algorithm.name):
         raise ValueError(
             f"--algo is {args.algo!r}, but sb3-htr trains {algorithm.name}: choose a method, --method {', '.join(methods())}; "
             "`python -m rl_zoo3.train` has SB3's algorithms."
@@ -75,13 +76,14 @@ def main(argv: Sequence[str]) -> None:
         more.add_argument("-n", "--n-timesteps", type=int, default=0)
         further, rest = more.parse_known_args(rest)
         rest += env
-        if rest or args.method:
-            more_than_run = " ".join(rest) or "--method"
+        if rest or args.method or args.algo:
+            more_than_run = " ".join(rest) or ("--method" if args.method else "--algo")
             raise ValueError(f"train --resume goes on with the run's own arguments: leave {more_than_run} out.")
         run = find_runs(args.resume)[-1]
         record = read_record(run / RECORD)
         if not {*OF_TRAINING} <= record.keys():
             raise ValueError(f"{run} is no run of sb3-htr train, so there is nothing to go on with: give the folder of one.")
+        check_numbers(**{"-n": (further.n_timesteps, 0)})
         planned = record["n_timesteps"] + further.n_timesteps
         if is_finished(run, record["env_id"], planned):
             done = n_steps_done(run)

@@ -82,7 +82,8 @@ def plot_curves(curves: dict[str, Curve], path: Path, title: str, x_label: str, 
     left, right = figure.subplots(1, 2)
     styles = curve_styles([curve.method for curve in curves.values()])
     for (colour, style), (label, curve) in zip(styles, curves.items(), strict=True):
-        label = f"{label} ({len(curve.returns)} seed{'s' * (len(curve.returns) > 1)})"
+        # matplotlib leaves out those that begin with _
+        label = f"{' ' * label.startswith('_')}{label} ({len(curve.returns)} seed{'s' * (len(curve.returns) > 1)})"
         band(left, curve.x, curve.returns, colour, style, label)
         band(right, curve.x, 100 * curve.successes, colour, style, label)
     right.set_ylim(-4, 104)
@@ -92,7 +93,7 @@ def plot_curves(curves: dict[str, Curve], path: Path, title: str, x_label: str, 
         axes.set_xlabel(x_label)
         axes.xaxis.get_major_locator().set_params(integer=True)
     span_unit_if_flat(left)
-    # Of three seeds and fewer, the IQM is the mean, and of two its bootstrap interval their range
+    # Of three seeds and fewer, the IQM is the mean, and its bootstrap interval their range
     seeds = {min(len(curve.returns), 4) for curve in curves.values()}
-    shown = {4: "IQM over seeds, 95 % interval", 3: "mean of 3 seeds, 95 % interval", 2: "mean and range of 2 seeds"}
+    shown = {4: "IQM over seeds, 95 % interval", 3: "mean and range of 3 seeds", 2: "mean and range of 2 seeds"}
     finish(figure, path, "; ".join([title, *(text for n, text in shown.items() if n in seeds)]))

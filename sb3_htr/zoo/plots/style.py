@@ -1,6 +1,7 @@
 """What all pictures share."""
 
 from collections.abc import Sequence
+from itertools import cycle
 from pathlib import Path
 
 from matplotlib.axes import Axes
@@ -25,7 +26,8 @@ def curve_styles(names: Sequence[str]) -> list[tuple[str, str]]:
     own = dict(zip((name for name in methods() if not name.endswith(PRIOR)), COLOURS, strict=False))
     own_styles = {f"{name}{end}": (colour, line) for name, colour in own.items() for end, line in (("", "-"), (PRIOR, "--"))}
     taken = {own_styles[name] for name in names if name in own_styles}
-    left = iter([style for line in LINES for colour in COLOURS if (style := (colour, line)) not in taken])
+    every = [(colour, line) for line in LINES for colour in COLOURS]
+    left = cycle([style for style in every if style not in taken] or every)
     first = [name in own_styles and name not in names[:i] for i, name in enumerate(names)]
     return [own_styles[name] if is_first else next(left) for name, is_first in zip(names, first, strict=True)]
 

@@ -195,7 +195,7 @@ def model_card(
     data = ModelCardData(library_name="stable-baselines3", tags=tags, model_name=name, eval_results=[result])
     kwargs = "".join(f", {key}={value!r}" for key, value in record["env_kwargs"].items())
     is_hidden = env_id.startswith("HiddenGoal/")
-    packages = [*(record["gym_packages"] or []), *(["htr_envs"] if is_hidden or not record["gym_packages"] else [])]
+    packages = dict.fromkeys([*(record["gym_packages"] or []), "htr_envs"])  # one's own may bring no env, but a method
     imports = "".join(f"import {package}  # registers the env\n" for package in packages)
     if is_hidden:
         imports += f'htr_envs.hide_goal("{env_id.partition("/")[2]}")  # registers the family\n'

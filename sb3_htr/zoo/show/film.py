@@ -64,5 +64,6 @@ class Film:
         sample = np.concatenate(self._frames[:: max(len(self._frames) // 8, 1)])
         palette = Image.fromarray(sample).quantize(128, Image.Quantize.MAXCOVERAGE)
         first, *rest = (Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in self._frames)
-        durations = [round(1000 * seconds) for seconds in self.seconds]
+        # A gif counts hundredths of a second, so the rounding of one frame is made up for by the next
+        durations = [10 * int(n) for n in np.diff(np.round(100 * np.cumsum(self.seconds)), prepend=0)]
         first.save(self.path, save_all=True, append_images=rest, duration=durations, loop=0, optimize=True)
