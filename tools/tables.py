@@ -39,7 +39,7 @@ HEADLINES: dict[str, dict[str, tuple[str, ...]]] = {
     "headline": {
         "point_robot": ("htr-ser", "pearl-dense", "pearl-sparse"),
         "wheeled": ("htr-ser", "pearl-dense", "pearl-sparse"),
-        "ant": ("htr-ser", "pearl-dense"),
+        "ant": ("htr-ser", "pearl-dense", "pearl-sparse"),
         "target_speed": ("htr-ser", "pearl-dense", "pearl-sparse"),
         "fetch_reach": ("htr-ser", "pearl-sparse"),
         "fetch_push": ("htr-ser", "pearl-sparse"),
@@ -56,7 +56,7 @@ COMPARED: dict[str, dict[str, tuple[str, ...]]] = {
     "differences": {
         "point_robot": ("pearl-sparse", "pearl-dense"),
         "wheeled": ("pearl-sparse", "pearl-dense"),
-        "ant": ("pearl-dense",),
+        "ant": ("pearl-sparse", "pearl-dense"),
         "target_speed": ("pearl-sparse", "pearl-dense"),
         "fetch_reach": ("pearl-sparse",),
         "fetch_push": ("pearl-sparse",),
