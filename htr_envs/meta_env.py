@@ -30,7 +30,7 @@ def _float_array(name: str, tasks: ArrayLike) -> FloatArray:
 class TaskDistribution(ABC):
     """A distribution of tasks and three fixed sets of them: small, picklable, stateless.
 
-    :param task_space: the box that every task lies in, shape (task_dim,).
+    :param task_space: the box that every task lies in, shape (task_dim,); kept with bounds of float32, as tasks have it.
     :param train_tasks: tasks to meta-train on, shape (n, task_dim).
     :param validation_tasks: tasks to choose hyper-parameters and checkpoints on, shape (n, task_dim).
     :param test_tasks: tasks to report results on, shape (n, task_dim).
