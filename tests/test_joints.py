@@ -18,13 +18,14 @@ from gymnasium import spaces
 from torch import nn
 from torch.nn import functional as F
 
-from helpers import ENV_ID, ROLLOUT, MakePEARL, parameters, with_policy
+from helpers import ENV_ID, ROLLOUT, TINY, MakePEARL, parameters, with_policy
 from helpers.experience import by_task
 from helpers.runs import run_folder, train_arguments
 from htr_envs import Dynamics, DynamicsEnv, DynamicsVectorEnv, TaskFamily, at_step, check_reward_type, check_task_env
 from sb3_htr import PEARL, evaluate_adaptation, load_untrusted
 from sb3_htr.adaptation import Explorer, Step, register_explorer
 from sb3_htr.adaptation.explorers import EXPLORERS, to_explorer
+from sb3_htr.common.segments import segment_sum
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
 from sb3_htr.experiments import grid
 from sb3_htr.htr import Relabeller, register_relabeller
@@ -128,6 +129,21 @@ class Forgetful(ContextEncoder):
         return super().extend(state, F.dropout(rows, 0.3, self.training), lengths)
 
 
+class DecodingEncoder(ContextEncoder):
+    """With a network that tells from z how much of a context was rewarded."""
+
+    def __init__(self, context_dim: int, latent_dim: int, *args: Any, **kwargs: Any) -> None:
+        super().__init__(context_dim, latent_dim, *args, **kwargs)
+        self.decoder = nn.Linear(latent_dim, 1)
+
+
+class DecodingPEARL(PEARL):
+    def auxiliary_losses(self, data: Any, obs: th.Tensor, z: th.Tensor, *posterior: th.Tensor) -> dict[str, th.Tensor]:
+        rewarded = segment_sum((data.context.rewards > 0).float(), data.context.lengths) / data.context.lengths
+        loss = ((self.encoder.decoder(z)[:, 0] - rewarded).square() * data.task_weights).sum()  # type: ignore[operator]
+        return {**super().auxiliary_losses(data, obs, z, *posterior), "decoder_loss": loss}
+
+
 class Heights(TaskFamily):
     """Hold a height."""
 
@@ -171,7 +187,7 @@ class Balloons(Dynamics[Heights]):
         return self.states, np.float32(-0.01) * lift[:, 0] ** 2, np.zeros(self.num_envs, dtype=np.bool_)
 
 
-TOYS = [(RandomTrainingTask,), (Lattice,), (GRUEncoder,), (Heights, Balloons)]
+TOYS = [(RandomTrainingTask,), (Lattice,), (GRUEncoder,), (DecodingEncoder, DecodingPEARL), (Heights, Balloons)]
 
 
 @pytest.mark.parametrize("toy", TOYS, ids=lambda toy: toy[0].__name__)
@@ -315,6 +331,32 @@ def test_what_a_recurrent_encoder_takes_in_later_is_taken_in_as_if_at_once(tiny_
     th.testing.assert_close(state, encoder.extend(encoder.empty(3), rows, lengths))
     mean, variance = encoder.posterior(state)
     assert (mean[1] == 0).all() and (variance[1] == 1).all()
+
+
+# --- a loss
+
+
+@pytest.mark.parametrize("cuda_graph", [False, True])
+def test_a_loss(tmp_path: Path, cuda_graph: bool) -> None:
+    """Its networks learn, the encoder learns from it, and both are saved."""
+    networks = with_policy(encoder_class=DecodingEncoder)
+    settings = {**TINY, "policy_kwargs": networks, "cuda_graph": cuda_graph, "seed": 3}
+    model, plain = (kind("MlpPolicy", ENV_ID, **settings) for kind in (DecodingPEARL, PEARL))
+    before = parameters(model)
+    for each in (model, plain):
+        each.learn(3 * ROLLOUT)
+    after, without = parameters(model), parameters(plain)
+    assert "train/decoder_loss" not in plain.logger.name_to_value
+    assert 0 < model.logger.name_to_value["train/decoder_loss"] < np.inf
+    assert not th.equal(after["encoder.decoder.weight"], before["encoder.decoder.weight"])
+    assert th.equal(without["encoder.decoder.weight"], before["encoder.decoder.weight"])
+    assert not th.equal(after["encoder.factors.0.weight"], without["encoder.factors.0.weight"])
+    model.save(tmp_path / "model")
+    loaded = DecodingPEARL.load(tmp_path / "model")
+    assert all(th.equal(value, after[name]) for name, value in parameters(loaded).items())
+    loaded.set_env(model.get_env())  # type: ignore[arg-type]
+    loaded.learn(ROLLOUT, reset_num_timesteps=False)
+    assert "train/decoder_loss" in loaded.logger.name_to_value
 
 
 # --- an env family

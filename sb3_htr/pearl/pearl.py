@@ -12,7 +12,7 @@ from sb3_htr.adaptation.explorers import Explorer
 from sb3_htr.common.divergence import check_not_diverged
 from sb3_htr.common.segments import repeat_segments
 from sb3_htr.common.settings import check_entropy, check_flags, check_numbers
-from sb3_htr.common.type_aliases import MultiTaskSamples, RewardLabels
+from sb3_htr.common.type_aliases import MultiTaskSamples
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
 from sb3_htr.pearl.divergence import check_posterior
 from sb3_htr.pearl.encoder import ContextEncoder, kl_to_prior
@@ -301,13 +301,10 @@ class PEARL(OffPolicyMetaAlgorithm):
         q = self.critic(obs_z, data.actions)
         critic_loss = ((q - target_q).square() * weight).sum()
         learning = [self.critic.optimizer, self.encoder.optimizer]
-        loss, reward_losses = critic_loss + self._current_kl_coef() * kl, {}
         if data.labels is not None:
             learning.append(self.reward_model.optimizer)
-            # The values of z, of which the gradient is weighted
-            weighted_z = th.lerp(z.detach(), z, self.reward_coef)
-            reward_losses = self._reward_losses(data.labels, obs, data.actions, weighted_z)
-            loss = loss + sum(reward_losses.values())
+        auxiliary_losses = self.auxiliary_losses(data, obs, z, mean, variance)
+        loss = critic_loss + self._current_kl_coef() * kl + sum(auxiliary_losses.values())
         for optimizer in learning:
             optimizer.zero_grad()
         loss.backward()
@@ -336,7 +333,7 @@ class PEARL(OffPolicyMetaAlgorithm):
             "critic_loss": critic_loss.detach(),
             "actor_loss": actor_loss.detach(),
             "kl_divergence": kl.detach(),
-            **{key: value.detach() for key, value in reward_losses.items()},
+            **{name: value.detach() for name, value in auxiliary_losses.items()},
             "ent_coef": ent_coef.detach().mean(),
             "posterior_std": (variance.detach().sqrt().mean(dim=1) * data.task_weights).sum(),
             "q_value": (q.detach().mean(dim=0) * weight).sum(),
@@ -344,10 +341,29 @@ class PEARL(OffPolicyMetaAlgorithm):
         }
         return mean.detach(), log
 
-    def _reward_losses(self, labels: RewardLabels, obs: th.Tensor, actions: th.Tensor, z: th.Tensor) -> dict[str, th.Tensor]:
-        """Of success, of the reward of a success, and of the task-free part."""
-        obs, actions, next_obs = obs[labels.rows], actions[labels.rows], self.policy.normalize(labels.next_observations)
-        success_loss, reward_loss = self.reward_model.losses(next_obs, z, labels)
+    def auxiliary_losses(
+        self, data: MultiTaskSamples, obs: th.Tensor, z: th.Tensor, mean: th.Tensor, variance: th.Tensor
+    ) -> dict[str, th.Tensor]:
+        """
+        What is learnt beside the critics' errors and the KL term: here by the reward model, of success, of the reward of a
+        success, and of the task-free part.
+
+        A hook for a loss of one's own on z: override it, and add to what this returns. Networks that such a loss needs belong
+        into the encoder, with which they learn and are saved. Where ``cuda_graph`` is on, no value may be waited for.
+
+        :param data: meta-batch of M tasks; in a mean over them each has its ``data.task_weights``, which sum to 1
+        :param obs: (N, obs_dim), its observations as networks see them, normalized
+        :param z: (M, latent_dim), drawn from the posteriors, with gradients to the encoder
+        :param mean: (M, latent_dim) of the posteriors
+        :param variance: (M, latent_dim) of the posteriors
+        :return: scalars, which are added to the loss of encoder and critics, and logged as ``train/`` and their name
+        """
+        labels = data.labels
+        if labels is None:
+            return {}
+        obs, actions, next_obs = obs[labels.rows], data.actions[labels.rows], self.policy.normalize(labels.next_observations)
+        # The values of z, of which the gradient is weighted
+        success_loss, reward_loss = self.reward_model.losses(next_obs, th.lerp(z.detach(), z, self.reward_coef), labels)
         task_free_error = self.reward_model.task_free(obs, actions, next_obs) - labels.task_free
         return {
             "success_loss": success_loss,
