@@ -40,6 +40,31 @@ def test_floors_are_below_ceilings(monkeypatch: pytest.MonkeyPatch, capsys: pyte
     assert floor < 0.1 and straight > 13 and still < 0 and drive > 125 and noise < 0 and thrust < 3 and hold > 30
 
 
+# Each worse than any robot
+BROKEN: tuple[dict[str, float], ...] = (
+    {"gain": 0.0},
+    {"missed": 1.0},
+    {"false": 0.3},
+    {"reward_noise": 9.0},
+    {"action_noise": 9.0},
+    {"observation_noise": 9.0},
+    {"delay": 20},
+)
+
+
+@pytest.mark.filterwarnings("ignore:.*more than meta-training has taught")
+def test_what_breaks_a_robot_breaks_adaptation(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    example = importlib.import_module("examples.imperfect_robot")
+    imperfections = {"none": example.Imperfection(), **{str(what): example.Imperfection(**what) for what in BROKEN}}
+    monkeypatch.setattr(example, "IMPERFECTIONS", imperfections)
+    monkeypatch.setattr(example, "SEEDS", range(1))
+    example.main("SparsePointRobot-v0")
+    rows = [line.strip("| ").split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
+    assert len(rows) == 8 and rows[0][1:] == ["none", rows[0][2], "1.00", "1.00"]
+    assert rows[1][2:] == ["21.0", "0.00", "0.00"], "one that stands still"
+    assert all(float(row[-1]) < 0.8 for row in rows[1:]), rows
+
+
 DENSE = {
     "half_cheetah_velocity": "HalfCheetahVelocity-v0",
     "ant_direction": "AntDirection-v0",
