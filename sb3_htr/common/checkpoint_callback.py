@@ -108,7 +108,8 @@ class CheckpointCallback(BaseCallback):
         self.keep = keep
         self.companions = companions
         self._last_calls = 0
-        self._written: Path | None = None
+        # What was written last, or gone on from: it is whole
+        self._whole: Path | None = None
         self._pending: dict[str, Any] | None = None
         # Of each callback, before anything was restored or counted
         self._made_with: list[dict[str, Any]] = []
@@ -129,6 +130,7 @@ class CheckpointCallback(BaseCallback):
                 f"within others counted, and goes on with {len(callbacks) - 1}: give it the same ones, in the same order."
             )
         model.load_state_dict(state["model"])
+        self._whole = self._folder(state["model"]["counters"]["num_timesteps"])
         self._made_with = [numbers_of(callback) for callback in callbacks]
         for callback, remembered in zip(callbacks, state["callbacks"], strict=True):
             callback.n_calls = remembered["n_calls"]
@@ -139,6 +141,9 @@ class CheckpointCallback(BaseCallback):
         self._last_calls = self.n_calls
         # Setting up the training makes a logger
         self._pending = state
+
+    def _folder(self, n_steps: int) -> Path:
+        return self.run / CHECKPOINTS / f"{n_steps}_steps"
 
     def _callbacks(self) -> list[BaseCallback]:
         return [self, *(part for companion in self.companions for part in parts_of(companion))]
@@ -207,7 +212,7 @@ class CheckpointCallback(BaseCallback):
             self._state()  # what cannot be saved says so before any work is done
 
     def _save(self, then: str = "Training goes on, and tries again before the next rollout.") -> None:
-        folder = self.run / CHECKPOINTS / f"{self.num_timesteps}_steps"
+        folder = self._folder(self.num_timesteps)
         self._stopped = self.stopping
         try:
             write_checkpoint(folder, self._state())
@@ -219,7 +224,7 @@ class CheckpointCallback(BaseCallback):
         self._last_calls = self.n_calls
         if self.verbose > 0:
             print(f"Checkpoint: {folder}")
-        self._written = folder
+        self._whole = folder
         self._remove_old()
 
     def _on_training_end(self) -> None:
@@ -230,8 +235,8 @@ class CheckpointCallback(BaseCallback):
         self._remove_old()
 
     def _remove_old(self) -> None:
-        # Those of killed processes, too; but never the one just written, which may be behind others that are damaged
-        old_ones = [folder for folder in checkpoints(self.run)[self.keep :] if folder != self._written]
+        # Those of killed processes, too; but never the one that is known to be whole, behind others that may be damaged
+        old_ones = [folder for folder in checkpoints(self.run)[self.keep :] if folder != self._whole]
         for old in [*old_ones, *(self.run / CHECKPOINTS).glob(".*_steps.*.tmp")]:
             with training_goes_on(f"The old checkpoint {old}", "removed"):
                 shutil.rmtree(old)

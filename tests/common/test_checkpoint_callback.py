@@ -11,6 +11,7 @@ import pytest
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CallbackList,
+    ConvertCallback,
     EveryNTimesteps,
     StopTrainingOnMaxEpisodes,
     StopTrainingOnNoModelImprovement,
@@ -204,15 +205,33 @@ def test_some_checkpoints_are_kept() -> None:
         CheckpointCallback(1, "run", keep=0)
 
 
+def damage_all_but(n_whole: int, run: Path) -> None:
+    for folder in checkpoints(run)[:-n_whole]:
+        shutil.rmtree(folder)
+        folder.mkdir()
+
+
 def test_the_checkpoint_just_written_is_kept(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
     """Behind a later one that is damaged, from which nothing could go on."""
     tiny_pearl().learn(4 * ROLLOUT, CheckpointCallback(1, str(tmp_path), keep=4))
-    for folder in checkpoints(tmp_path)[:2]:
-        shutil.rmtree(folder)
-        folder.mkdir()
+    damage_all_but(2, tmp_path)
     callback, model = CheckpointCallback(ROLLOUT // 4, str(tmp_path), keep=1), tiny_pearl()
     with pytest.warns(UserWarning, match="next older checkpoint"):
         callback.restore(model, load_latest(tmp_path)[1])
     model.learn(ROLLOUT, callback, reset_num_timesteps=False)
     with pytest.warns(UserWarning, match="next older checkpoint"):
         assert load_latest(tmp_path)[0].name == f"{3 * ROLLOUT}_steps"
+
+
+def test_the_checkpoint_that_a_training_went_on_from_is_kept_until_there_is_another(
+    tiny_pearl: MakePEARL, tmp_path: Path
+) -> None:
+    """Also where the training ends before."""
+    tiny_pearl().learn(3 * ROLLOUT, CheckpointCallback(1, str(tmp_path), keep=3))
+    damage_all_but(1, tmp_path)
+    callback, model = CheckpointCallback(1, str(tmp_path)), tiny_pearl()
+    with pytest.warns(UserWarning, match="next older checkpoint"):
+        callback.restore(model, load_latest(tmp_path)[1])
+    model.learn(ROLLOUT, [callback, ConvertCallback(lambda *_: False)], reset_num_timesteps=False)
+    with pytest.warns(UserWarning, match="next older checkpoint"):
+        assert load_latest(tmp_path)[0].name == f"{ROLLOUT}_steps"
