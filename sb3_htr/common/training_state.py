@@ -91,9 +91,11 @@ class Resumable(BaseAlgorithm):
 
 
 def _tensor(value: Any) -> Any:
-    """A number or array, with its dtype: means of float32 numbers are other ones than those of float64. Texts stay texts."""
-    return value if isinstance(value, str) else th.from_numpy(np.array(value))
+    """A number or array of numpy, with its dtype: means of float32 are other ones than those of float64. All else is kept."""
+    if isinstance(value, np.generic | np.ndarray) and value.dtype.kind in "biufc":
+        return th.from_numpy(np.array(value))
+    return str(value) if isinstance(value, str) else value  # numpy has texts of its own
 
 
 def _number(tensor: Any) -> Any:
-    return tensor if isinstance(tensor, str) else tensor.cpu().numpy()[()]
+    return tensor.cpu().numpy()[()] if isinstance(tensor, th.Tensor) else tensor

@@ -49,10 +49,14 @@ class HasNumbersOfNumpy(BaseCallback):
         pass
 
 
-class InAKitchen(gym.Wrapper):
+class Somewhere(gym.Wrapper):
+    def __init__(self, env: Any, scene: Any) -> None:
+        super().__init__(env)
+        self.scene = scene
+
     def step(self, action: Any) -> Any:
         *others, info = self.env.step(action)
-        return *others, {**info, "scene": "kitchen"}
+        return *others, {**info, "scene": self.scene}
 
 
 def test_what_waits_for_the_log_does_not_spoil_a_checkpoint(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
@@ -82,14 +86,19 @@ def test_a_state_that_cannot_be_saved_is_no_full_disk(tiny_pearl: MakePEARL, tmp
         tiny_pearl().learn(3 * ROLLOUT, [callback, CheckpointCallback(1, str(tmp_path), companions=[callback])])
 
 
-def test_texts_of_the_monitor_go_on(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "scene", ["kitchen", np.str_("kitchen"), None, {"room": 3}, (1, "a"), 2**70, 0.1, np.float32(0.1), np.arange(2)]
+)
+def test_what_the_monitor_notes_goes_on(scene: Any, tiny_pearl: MakePEARL, tmp_path: Path) -> None:
     def make() -> Any:
-        return DummyVecEnv([lambda: Monitor(InAKitchen(gym.make(ENV_ID)), info_keywords=("scene",))] * 4)
+        return DummyVecEnv([lambda: Monitor(Somewhere(gym.make(ENV_ID), scene), info_keywords=("scene",))] * 4)
 
     tiny_pearl(make()).learn(2 * ROLLOUT, CheckpointCallback(1, str(tmp_path)))
     callback, model = CheckpointCallback(1, str(tmp_path)), tiny_pearl(make())
     callback.restore(model, load_latest(tmp_path)[1])
-    assert {info["scene"] for info in model.ep_info_buffer or ()} == {"kitchen"}
+    assert len(model.ep_info_buffer or ()) == 24
+    for info in model.ep_info_buffer or ():
+        np.testing.assert_equal(info["scene"], scene, strict=True)
 
 
 def test_a_training_goes_on_with_as_many_envs(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
