@@ -76,15 +76,16 @@ def set_env_states(env: VecEnv, states: list[str]) -> None:
 @contextmanager
 def kept_env_states(env: VecEnv) -> Iterator[None]:
     """
-    The generators of envs are afterwards as they were before, whatever is seeded and drawn within.
+    The generators of envs are afterwards as they were before, whatever is seeded and drawn within, unless it is interrupted.
 
     :param env: those of envs that have no generator of gymnasium's are left alone
     """
     states = get_env_states(env) if env.has_attr("np_random") else None
     try:
         yield
-    except (EOFError, ConnectionError):
-        states = None  # the process of an env died, which has no state any more
+    except (EOFError, ConnectionError, KeyboardInterrupt):
+        # The process of an env died, which has no state any more, or is amid an answer, which would be read as that to another
+        states = None
         raise
     finally:
         if states is not None:

@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from helpers import ENV_ID
 from htr_envs import DynamicsVectorEnv, PointRobotFamily, PointRobotVectorEnv, Trajectory
 from htr_envs.point_robot import PointRobotDynamics
+from sb3_htr.common.random_state import kept_env_states
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env
 from sb3_htr.common.vec_wrappers import PatientResultsWriter
 
@@ -171,6 +172,16 @@ def test_ctrl_c_leaves_envs_in_processes_to_the_training() -> None:
     env.step(np.zeros((1, 2), dtype=np.float32))
     env.close()
     assert all(process.exitcode == 0 for process in processes)
+
+
+def test_an_interrupt_amid_a_step_of_envs_in_processes_stays_one() -> None:
+    """The generators of envs are asked for and set through the pipe that the answer to the step comes through."""
+    env = make_task_vec_env(ENV_ID, 2, vec_env_class=SubprocVecEnv)
+    env.reset()
+    with pytest.raises(KeyboardInterrupt), kept_env_states(env):
+        env.step_async(np.zeros((2, 2), dtype=np.float32))
+        raise KeyboardInterrupt
+    env.close()
 
 
 LEFT_OPEN: list[Any] = []
