@@ -128,7 +128,9 @@ def seeded_actions(seed: int | tuple[int, ...], deterministic: bool) -> Iterator
     :param seed: of an evaluation, or of a part of it; other draws of it, as those of z, have generators of this very seed
     :param deterministic: whether none are drawn
     """
-    with th.random.fork_rng(enabled=not deterministic):
+    # By default it starts all GPUs, also where the CPU computes
+    gpus = range(th.cuda.device_count()) if th.cuda.is_initialized() else ()
+    with th.random.fork_rng(gpus, enabled=not deterministic):
         if not deterministic:
             th.manual_seed(int(np.random.SeedSequence(seed).generate_state(1)[0]))
         yield

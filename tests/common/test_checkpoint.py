@@ -26,7 +26,6 @@ from sb3_htr.common.checkpoint import (
     read_checkpoint,
     write_checkpoint,
 )
-from sb3_htr.common.random_state import get_global_state, set_global_state
 
 
 def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
@@ -189,11 +188,3 @@ def test_who_wrote_a_checkpoint_may_be_unknown(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr("sb3_htr.common.checkpoint.versions", lambda: {"python": "3"})
     write_checkpoint(tmp_path / "1_steps", {"x": 1})
     assert read_checkpoint(tmp_path / "1_steps") == {"x": 1}
-
-
-def test_a_training_on_the_cpu_starts_no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(th.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(th.cuda, "get_rng_state_all", lambda: pytest.fail("asks a GPU that nobody uses"))
-    state = get_global_state()
-    assert state["cuda"] == []
-    set_global_state(state)
