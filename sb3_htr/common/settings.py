@@ -97,7 +97,9 @@ def check_numbers(**numbers: tuple[Any, float] | tuple[Any, float, float]) -> No
         # written so that nan, which compares with nothing, is refused too
         if isinstance(value, bool) or not (isinstance(value, kind) and low <= value <= high):
             article = "a whole number" if whole else "a number"
-            limits = f" of at least {low:g}" if high >= sys.float_info.max else f" from {low:g} to {high:g}"
+            # Whole numbers in full: of a large one, the first digits are another number
+            least, most = (limit if isinstance(limit, int) else f"{limit:g}" for limit in (low, high))
+            limits = f" of at least {least}" if high >= sys.float_info.max else f" from {least} to {most}"
             raise ValueError(f"{name} is {given!r}, expected {article}{'' if low == LOWEST else limits}.")
 
 

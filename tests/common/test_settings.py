@@ -62,3 +62,10 @@ def test_numbers_of_numpy_are_compared_as_numbers() -> None:
     for value in (np.float32(np.nan), np.float32(-1), np.bool_(True), np.complex64(1)):
         with pytest.raises(ValueError, match=r"rate is .*, expected a number of at least 0"):
             check_numbers(rate=(value, 0.0))
+
+
+def test_limits_are_told_in_full() -> None:
+    with pytest.raises(ValueError, match=r"seed is 4294967296, expected a whole number from 0 to 4294967295\."):
+        check_numbers(seed=(2**32, 0, 2**32 - 1))
+    with pytest.raises(ValueError, match=r"doubt is 1, expected a number from 1e-06 to 0\.5\."):
+        check_numbers(doubt=(1, 1e-6, 0.5))
