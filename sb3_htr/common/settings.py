@@ -209,6 +209,6 @@ def check_keywords(
     for name in given:
         if name not in known:
             public = sorted(name for name in known if not name.startswith("_"))
-            nearest = difflib.get_close_matches(name, public, n=1)
+            nearest = difflib.get_close_matches(str(name), public, n=1)  # in a YAML file, it may be a number
             advice = f"did you mean {nearest[0]}?" if nearest else f"expected one of {public}."
             raise ValueError(f"{owner} has no setting {name!r}: {advice}")

@@ -42,6 +42,7 @@ def test_anything_else_is_answered_with_what_there_is(what: str, kinds: Kinds, b
     [
         (EXPLORERS, Explorer, {"name": "aggregate", "max_setback": 2}, "'max_setback': did you mean max_setbacks"),
         (EXPLORERS, Explorer, {"name": "prior", "scale": 2}, "'prior' has no setting 'scale': expected one of"),
+        (EXPLORERS, Explorer, {"name": "prior", 3: 4}, "'prior' has no setting 3: expected one of"),
         (EXPLORERS, Explorer, {"name": "aggregate", "scale": -1}, "scale is -1, expected a number of at least 0"),
         (EXPLORERS, Explorer, {"name": "aggregate", "clearly_better": 0.9}, "clearly_better is 0.9, expected a number of at"),
         (EXPLORERS, Explorer, {"name": "belief", "doubt": 0.6}, "doubt is 0.6, expected a number from 1e-06 to 0.5"),
