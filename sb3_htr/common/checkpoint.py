@@ -80,7 +80,7 @@ def read_checkpoint(folder: str | os.PathLike[str]) -> dict[str, Any]:
         manifest = json.loads((folder / MANIFEST).read_text())
         found, expected = manifest["format"], manifest["sha256"][STATE]
         writer = manifest["versions"].get("sb3_htr", "of an unknown version")
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise DamagedCheckpoint(f"{folder} has no readable {MANIFEST}: it is damaged, or no checkpoint.") from None
     if found != FORMAT:
         raise DamagedCheckpoint(f"{folder} has format {found}, expected {FORMAT}: read it with sb3_htr {writer}, its writer.")

@@ -129,7 +129,12 @@ def foreign_format(folder: Path) -> None:
     (folder / MANIFEST).write_text(json.dumps({**manifest, "format": 999}))
 
 
-DAMAGES = [truncate, flip_a_bit, empty, remove_state, remove_manifest, garble_manifest, foreign_format]
+def other_versions(folder: Path) -> None:
+    manifest = json.loads((folder / MANIFEST).read_text())
+    (folder / MANIFEST).write_text(json.dumps({**manifest, "versions": []}))
+
+
+DAMAGES = [truncate, flip_a_bit, empty, remove_state, remove_manifest, garble_manifest, foreign_format, other_versions]
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
