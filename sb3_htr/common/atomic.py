@@ -6,7 +6,7 @@ import re
 import shutil
 import struct
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from uuid import uuid4
 
@@ -47,8 +47,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         if temporary.is_dir() and path.is_dir():
             shutil.rmtree(path)
         os.replace(temporary, path)
-        # The new name must survive a power cut too; Windows opens no folder for that
-        if os.name == "posix":
+        # The new name is to survive a power cut too, where a folder can be opened and synced: the file is there either way
+        with suppress(OSError):
             parent = os.open(path.parent, os.O_RDONLY)
             try:
                 os.fsync(parent)

@@ -1,5 +1,6 @@
 """Files that are never half written, damage that is noticed, and reading that runs no code."""
 
+import errno
 import fcntl
 import json
 import os
@@ -57,6 +58,20 @@ def test_files_are_synced_by_handles_that_may_write(tmp_path: Path, monkeypatch:
     with atomic_path(tmp_path / "file") as path:
         path.write_text("whole")
     assert len(synced) == 1 and (tmp_path / "file").read_text() == "whole"
+
+
+def test_a_file_is_written_where_folders_cannot_be_synced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on VirtualBox's shared folders."""
+    fsync = os.fsync
+
+    def fsync_of_files(handle: int) -> None:
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(errno.EINVAL, "Invalid argument")
+        fsync(handle)
+
+    monkeypatch.setattr("os.fsync", fsync_of_files)
+    write_checkpoint(tmp_path / "1_steps", {"x": 1})
+    assert read_checkpoint(tmp_path / "1_steps") == {"x": 1}
 
 
 @pytest.mark.parametrize(
