@@ -22,6 +22,8 @@ def family_facts(family: TaskFamily) -> dict[str, str]:
     def fact(value: Any) -> str:
         if isinstance(value, th.Tensor):
             value = value.detach().cpu().numpy()
+        if isinstance(value, np.ndarray) and value.dtype.hasobject:
+            value = value.tolist()  # its bytes are addresses
         if isinstance(value, np.ndarray):
             return f"array of shape {value.shape}, {hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()[:12]}"
         if isinstance(value, set | frozenset):

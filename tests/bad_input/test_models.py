@@ -106,6 +106,7 @@ def test_families_are_compared_by_all_that_is_in_them() -> None:
         ({"x": (Band(0.2),)}, {"x": (Band(0.3),)}),
         (tensor, tensor + (tensor == 1000)),
         ({0, 8}, {0, 16}),
+        (np.array(["room", [1]], dtype=object), np.array(["room", [2]], dtype=object)),
     ):
         assert facts(one) != facts(other)
         assert facts(one) == facts(copy.deepcopy(one))
