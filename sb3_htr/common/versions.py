@@ -57,7 +57,8 @@ def commit(*paths: str) -> dict[str, str | bool]:
     """
 
     def git(*arguments: str) -> str:
-        command = ["git", *arguments]
+        # Else git refreshes its index as it reads, and a commit that is made meanwhile finds it locked
+        command = ["git", "--no-optional-locks", *arguments]
         # A path need not be text
         done = subprocess.run(command, capture_output=True, errors="replace", check=True, cwd=Path(__file__).parent)
         return done.stdout.strip()

@@ -1,5 +1,7 @@
 """What a result was made with."""
 
+import os
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -14,3 +16,17 @@ def test_a_path_that_is_no_text_does_not_stop_a_run(tmp_path: Path, monkeypatch:
     git.chmod(0o700)
     monkeypatch.setenv("PATH", str(tmp_path))
     assert commit()["clean"] is False
+
+
+def test_a_checkout_is_read_and_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A commit that is made meanwhile would find git's index locked."""
+    code = tmp_path / "code.py"
+    code.touch()
+    author = ["-c", "user.name=x", "-c", "user.email=x"]
+    for command in (["init", "-q"], ["add", "."], [*author, "commit", "-q", "-m", "x"]):
+        subprocess.run(["git", *command], check=True, cwd=tmp_path)
+    os.utime(code, (1e9, 1e9))  # git looks into the file, and would note that it is the same
+    index = (tmp_path / ".git" / "index").read_bytes()
+    monkeypatch.setattr("sb3_htr.common.versions.__file__", str(code))
+    assert commit()["clean"] is True
+    assert (tmp_path / ".git" / "index").read_bytes() == index
