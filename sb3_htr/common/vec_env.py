@@ -5,8 +5,9 @@ import os
 import re
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from itertools import count
+from multiprocessing import active_children
 from multiprocessing.process import BaseProcess
 from multiprocessing.util import Finalize
 from typing import Any, cast
@@ -175,6 +176,7 @@ def make_task_vec_env(
     :return: a monitored VecEnv
     :raises ValueError: for an env without tasks, no envs, or what is no id
     :raises gymnasium.error.NameNotFound: for an id that is not registered
+    :raises RuntimeError: for an env that cannot be made in a process of its own
     """
     check_numbers(n_envs=(n_envs, 1))
     if not isinstance(env_id, str):
@@ -194,9 +196,11 @@ def make_task_vec_env(
     venv: VecEnv
     # A batch draws no pictures
     if spec.vector_entry_point is None or wrapper is not None or vec_env_class is not None or "render_mode" in env_kwargs:
+        kind = vec_env_class or DummyVecEnv
+        in_processes = issubclass(kind, SubprocVecEnv)
 
         def make_env() -> gym.Env:
-            if vec_env_class is not None and issubclass(vec_env_class, SubprocVecEnv):
+            if in_processes:
                 # For the training, which ends a rollout, and then these
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
                 signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -204,12 +208,13 @@ def make_task_vec_env(
             env = gym.make(spec, **env_kwargs)
             return env if wrapper is None else wrapper(env)
 
-        with arguments_are_known(env_id, env_kwargs):
-            venv = (vec_env_class or DummyVecEnv)([make_env] * n_envs)
+        with arguments_are_known(env_id, env_kwargs), _all_or_none(env_id) if in_processes else nullcontext():
+            venv = kind([make_env] * n_envs)
+            has_task_family = venv.has_attr("task_family")  # asks all of them
         if isinstance(venv, SubprocVecEnv):
             # Where nobody closes it: at exit, multiprocessing waits for these processes, after a SIGTERM, which they ignore
             Finalize(venv, _kill, [venv.processes], exitpriority=0)
-        check_has_task_family(venv.has_attr("task_family"))
+        check_has_task_family(has_task_family)
     else:
         with arguments_are_known(env_id, env_kwargs):
             vector_env = gym.make_vec(env_id, n_envs, vectorization_mode="vector_entry_point", **env_kwargs)
@@ -257,6 +262,22 @@ def arguments_are_known(env_id: str, env_kwargs: dict[str, Any]) -> Iterator[Non
         raise ValueError(
             f"{env_id} takes no argument {unknown[1]!r}: leave it out, or correct it. The documentation of the env, and of "
             "its task family, has those that it takes."
+        ) from error
+
+
+@contextmanager
+def _all_or_none(env_id: str) -> Iterator[None]:
+    """Around what makes envs in processes: if some cannot be made, or it is interrupted, the others would be waited for."""
+    before = active_children()
+    try:
+        yield
+    except BaseException as error:
+        _kill([process for process in active_children() if process not in before])
+        if not isinstance(error, EOFError | ConnectionError):
+            raise
+        raise RuntimeError(
+            f"The process of an env died as {env_id} was made in it: its own traceback is printed above. Envs in one process "
+            "(DummyVecEnv) show it here."
         ) from error
 
 

@@ -3,7 +3,7 @@
 import os
 import signal
 import time
-from multiprocessing import get_context
+from multiprocessing import current_process, get_context
 from pathlib import Path
 from typing import Any
 
@@ -211,6 +211,30 @@ def test_a_process_ends_that_leaves_envs_open(exitcode: int) -> None:
     process.join(30)
     process.kill()
     assert process.exitcode == exitcode
+
+
+def test_an_env_that_cannot_be_made_in_a_process_is_told_of() -> None:
+    with pytest.raises(RuntimeError, match=f"The process of an env died as {ENV_ID} was made in it: its own traceback"):
+        make_task_vec_env(ENV_ID, 1, env_kwargs={"goal": 1}, vec_env_class=SubprocVecEnv)
+
+
+@pytest.mark.parametrize("how", ["fails", "interrupts"])
+def test_a_process_ends_that_could_make_some_of_its_envs_alone(how: str) -> None:
+    def make(env: gym.Env) -> gym.Env:
+        if current_process().name.endswith(":1"):
+            time.sleep(0.5)  # as the other one is made
+            if how == "fails":
+                raise MemoryError
+            os.kill(os.getppid(), signal.SIGINT)
+            time.sleep(60)
+        return env
+
+    kwargs = {"wrapper": make, "vec_env_class": ForkedVecEnv}
+    process = get_context("fork").Process(target=make_task_vec_env, args=[ENV_ID, 2], kwargs=kwargs)
+    process.start()
+    process.join(30)
+    process.kill()
+    assert process.exitcode == 1
 
 
 def test_runs_of_consecutive_seeds_share_no_env() -> None:
