@@ -88,8 +88,8 @@ class CheckpointCallback(BaseCallback):
         that has no ``state_dict``, each attribute that is a number, but for arguments of its constructor that did not change
     :param name_prefix: for SB3's signature, not used
     :param verbose: 1 says where checkpoints are written
-    :raises ValueError: if none would be kept; at the beginning of a training, if another callback calls it, as
-        ``EveryNTimesteps`` would
+    :raises ValueError: if none would be kept, or ``save_freq`` is below 1; at the beginning of a training, if another callback
+        calls it, as ``EveryNTimesteps`` would
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class CheckpointCallback(BaseCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
-        check_numbers(keep=(keep, 1))
+        check_numbers(save_freq=(save_freq, 1.0), keep=(keep, 1))
         self.save_freq = save_freq
         self.run = Path(save_path)
         self.keep = keep

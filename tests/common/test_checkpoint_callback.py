@@ -212,6 +212,9 @@ def test_a_training_after_one_that_was_stopped_is_none_that_was(tiny_pearl: Make
 def test_some_checkpoints_are_kept() -> None:
     with pytest.raises(ValueError, match="keep is 0, expected a whole number of at least 1"):
         CheckpointCallback(1, "run", keep=0)
+    for save_freq in (-1, 0, None):
+        with pytest.raises(ValueError, match=f"save_freq is {save_freq}, expected a number of at least 1"):
+            CheckpointCallback(save_freq, "run")  # type: ignore[arg-type]
 
 
 def damage_all_but(n_whole: int, run: Path) -> None:
