@@ -62,7 +62,8 @@ def check_rows(name: str, values: np.ndarray, *expected: int) -> None:
     """
     if np.shape(values) != expected:
         raise ValueError(f"The {name} have shape {np.shape(values)}, expected {expected}, a row for each env.")
-    usual = np.abs(values) <= LARGEST  # which nothing is that is NaN
+    # Which nothing is that is NaN; in a float16, the bound would be infinite
+    usual = np.abs(values, dtype=np.float64) <= LARGEST
     if not usual.all():
         env = int((~usual).reshape(len(values), -1).any(axis=1).argmax())
         raise ValueError(

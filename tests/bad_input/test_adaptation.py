@@ -132,6 +132,14 @@ def test_nan_at_meta_test_is_refused(explorer: str, tiny_pearl: MakePEARL) -> No
             model.adapt(env, n_episodes=2, explorer=explorer)
 
 
+@pytest.mark.filterwarnings("error")
+def test_numbers_of_a_sensor_may_be_halves(tiny_pearl: MakePEARL) -> None:
+    adaptation = tiny_pearl().start_adaptation(1)
+    adaptation.act(np.array([[1.0, 0.0]], dtype=np.float16))
+    with pytest.raises(ValueError, match=r"The observations of env 0 are \[inf  0\.\], expected finite numbers"):
+        adaptation.act(np.array([[np.inf, 0.0]], dtype=np.float16))
+
+
 @pytest.mark.parametrize("shape", [(2, 1), (2, 3), (2,)])
 def test_observations_of_another_shape_are_refused_at_meta_test(tiny_pearl: MakePEARL, shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=rf"observations have shape {re.escape(str(shape))}, expected \(2, 2\), a row"):
