@@ -10,6 +10,7 @@ from stable_baselines3.common.utils import get_device
 
 from sb3_htr.adaptation.actor_alone import acting_state, make_actor_alone
 from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.checks import check_device
 from sb3_htr.common.errors import OPEN_ERRORS
 from sb3_htr.common.latent_policy import Obs, State
 from sb3_htr.common.safe_load import load_plain
@@ -70,8 +71,9 @@ class AdaptedAgent:
         :param device: torch device
         :return: an agent that acts as the one that was saved
         :raises OSError: if there is no such file, or it cannot be opened
-        :raises ValueError: if it is another kind of file
+        :raises ValueError: if it is another kind of file, or the device cannot be used; that there is no GPU is warned of
         """
+        check_device(device)
         path = with_suffix(path, ".pt")
         try:
             state: dict[str, Any] = load_plain(path)

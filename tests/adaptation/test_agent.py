@@ -51,6 +51,16 @@ def test_a_saved_agent_acts_as_it_did(settings: dict[str, Any], wrap: Any, tiny_
     np.testing.assert_array_equal(again.predict(obs, deterministic=True)[0], theirs)
 
 
+def test_an_agent_is_loaded_to_a_device_that_there_is(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    tiny_pearl().adapt(gym.make(ENV_ID), n_episodes=1).save(tmp_path / "agent")
+    with pytest.raises(ValueError, match="The device 'gpu' cannot be used: give cpu, cuda or cuda:N"):
+        AdaptedAgent.load(tmp_path / "agent", "gpu")
+    if not th.cuda.is_available():
+        with pytest.warns(UserWarning, match="There is no cuda that torch could use: cpu is used") as caught:
+            AdaptedAgent.load(tmp_path / "agent", "cuda")
+        assert caught[0].filename == __file__
+
+
 def test_an_actor_of_ones_own_is_refused(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
     agent = tiny_pearl(policy_kwargs=with_policy(activation_fn=nn.Softsign)).adapt(gym.make(ENV_ID), n_episodes=1)
     with pytest.raises(ValueError, match=r"Only SB3's Actor with one of the activations ReLU, .* can be saved alone"):
