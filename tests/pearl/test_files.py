@@ -465,9 +465,11 @@ def test_what_acts_in_a_way_of_its_own_is_not_loaded_as_something_else(tiny_pear
             load_untrusted(tmp_path / name, ENV_ID)
         assert PEARL.load(tmp_path / name).policy is not None
     load_untrusted(tmp_path / "explorer", ENV_ID, explorer="prior")
-    agent = AdaptedAgent(own.policy, np.zeros(3, dtype=np.float32), np.zeros(0), np.zeros(0, dtype=bool))
-    with pytest.raises(ValueError, match="acts in a way of its own: save the model"):
-        agent.save(tmp_path / "agent")
+    small = gym.wrappers.RescaleAction(gym.make(ENV_ID), np.float32(-1e-4), np.float32(1e-4))
+    for model in (own, PEARL(ActsByHalf, small, policy_kwargs=with_policy())):
+        agent = AdaptedAgent(model.policy, np.zeros(3, dtype=np.float32), np.zeros(0), np.zeros(0, dtype=bool))
+        with pytest.raises(ValueError, match="acts in a way of its own: save the model"):
+            agent.save(tmp_path / "agent")
 
 
 def test_what_was_refused_is_not_there(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
