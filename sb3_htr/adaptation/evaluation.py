@@ -123,7 +123,9 @@ def run_adaptation(
             steps.append(np.array([info.get("achieved_task", ()) for info in step.infos], dtype=np.float32))
             episode_of_step.append(column)
             episode += step.dones
-    achieved = _by_episode(np.stack(steps, axis=1), np.stack(episode_of_step, axis=1), n_episodes)
+    # Of tasks of one dimension, some envs tell a number
+    rows = np.stack(steps, axis=1).reshape(n_envs, len(steps), -1)
+    achieved = _by_episode(rows, np.stack(episode_of_step, axis=1), n_episodes)
     return AdaptationRecord(returns[:, :n_episodes], successes[:, :n_episodes], achieved)
 
 

@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from helpers import ENV_ID, PRIOR, ROLLOUT, MakePEARL
 from helpers.adaptations import know_tasks
+from helpers.broken_envs import LineEnv
 from htr_envs import DynamicsVectorEnv, PointRobotFamily
 from htr_envs.point_robot import PointRobotDynamics
 from sb3_htr import PEARL, evaluate_adaptation
@@ -138,6 +139,21 @@ def test_achieved_tasks_are_the_path(tiny_pearl: MakePEARL) -> None:
     assert record.achieved.shape == (100, 2, 20, 2) and np.isfinite(record.achieved).all()
     steps = np.abs(np.diff(record.achieved, axis=2))
     assert steps.max() <= 0.1 + 1e-6
+
+
+def test_of_tasks_of_one_dimension_the_achieved_one_may_be_a_number(tiny_pearl: MakePEARL) -> None:
+    """Training takes it, and then an evaluation must."""
+
+    class Number(LineEnv):
+        def alter(self, observation: Any, reward: Any, terminated: Any, truncated: Any, info: Any) -> Any:
+            return observation, reward, terminated, truncated, {**info, "achieved_task": float(info["achieved_task"][0])}
+
+    records = []
+    for kind in (LineEnv, Number):
+        env = DummyVecEnv([kind] * 2)
+        records.append(record_adaptation(tiny_pearl(env, n_tasks_per_rollout=2).learn(60), env, n_episodes=2))
+    assert records[0].achieved.shape == (2, 2, 10, 1)
+    np.testing.assert_array_equal(records[0].achieved, records[1].achieved)
 
 
 # --- adapt()
