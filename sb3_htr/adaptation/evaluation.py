@@ -145,12 +145,15 @@ def task_set(family: TaskFamily, tasks: str | ArrayLike) -> np.ndarray:
     :param family: of an env
     :param tasks: ``"train"``, ``"validation"``, ``"test"``, or task vectors
     :return: (n_tasks, task_dim) float32
-    :raises ValueError: for another word, or an array of another shape
+    :raises ValueError: for another word, a set that the family lacks, or an array of another shape
     """
     if isinstance(tasks, str):
         if tasks not in TASK_SETS:
             raise ValueError(f"tasks is {tasks!r}, expected one of {list(TASK_SETS)}, or an array of task vectors.")
-        tasks = getattr(family, f"{tasks}_tasks")
+        name = f"{tasks}_tasks"
+        if not hasattr(family, name):
+            raise ValueError(f"The env's task_family has no {name}: add them, or pass an array of task vectors.")
+        tasks = getattr(family, name)
     vectors = np.asarray(tasks, dtype=np.float32)
     if vectors.ndim != 2 or len(vectors) == 0:
         raise ValueError(f"tasks have shape {vectors.shape}, expected (n_tasks, task_dim) with at least one task.")

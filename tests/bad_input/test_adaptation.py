@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -19,6 +20,7 @@ from htr_envs import PointRobotFamily
 from sb3_htr import PEARL, AdaptedAgent, evaluate_adaptation
 from sb3_htr.adaptation import Step
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
+from sb3_htr.adaptation.evaluation import task_set
 from sb3_htr.rivals.rl2 import RL2
 from sb3_htr.rivals.scripted import ScriptedAgent
 
@@ -211,6 +213,9 @@ def test_what_evaluations_are_given_by_mistake(tiny_pearl: MakePEARL) -> None:
     model = tiny_pearl()
     with pytest.raises(ValueError, match=r"tasks is 'valid', expected one of \['test', 'validation', 'train'\]"):
         evaluate_adaptation(model, ENV_ID, tasks="valid")
+    family: Any = SimpleNamespace(train_tasks=np.zeros((3, 2)))
+    with pytest.raises(ValueError, match="The env's task_family has no validation_tasks: add them, or pass an array of task"):
+        task_set(family, "validation")
     with pytest.raises(ValueError, match=r"tasks have shape \(\), expected \(n_tasks, task_dim\)"):
         evaluate_adaptation(model, ENV_ID, 5)
     with pytest.warns(UserWarning, match="No reward"):
