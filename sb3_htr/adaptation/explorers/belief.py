@@ -34,7 +34,8 @@ class Belief(ParticleExplorer):
     whose value, as it goes on, is not what it was at the start, searches on to its end. Two searches in a row that end without
     a reward on the way to the same task tell against it and those like it.
 
-    :param margin: a particle must promise so many times what the best episode returned, to be tried in its place; 1 or more
+    :param margin: 1 or more. So many times what the best episode with one z returned must a particle promise, to be tried in
+        its place, and what the best of all episodes returned a new one, for the encoder to be asked about it
     :param kept: in [0, 1], when an episode with one z keeps its word: of what was found, the share that it must return to end
         the search; of what the critics promised at its start, the share that they must still promise as long as it is
         unrewarded. By measurement, docs/trials.md
