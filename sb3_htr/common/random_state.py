@@ -80,7 +80,8 @@ def kept_env_states(env: VecEnv) -> Iterator[None]:
 
     :param env: those of envs that have no generator of gymnasium's are left alone
     """
-    states = get_env_states(env) if env.has_attr("np_random") else None
+    generators = env.get_attr("np_random") if env.has_attr("np_random") else [None]
+    states = get_env_states(env) if all(isinstance(each, np.random.Generator) for each in generators) else None
     try:
         yield
     except (EOFError, ConnectionError, KeyboardInterrupt):

@@ -292,6 +292,22 @@ def test_an_evaluation_in_the_env_of_training_leaves_its_random_state_alone(tiny
     assert get_env_states(env) == before
 
 
+class OldGenerator(gym.Wrapper[Any, Any, Any, Any]):
+    """Draws by numpy's generator of before."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        returned = self.env.reset(seed=seed or 0, options=options)  # which has it draw its task by a new one
+        self.unwrapped.np_random = np.random.RandomState(seed)  # type: ignore[assignment]
+        return returned
+
+
+def test_envs_whose_generator_is_an_old_one_are_evaluated_in_as_well(tiny_pearl: MakePEARL) -> None:
+    model, env, tasks = tiny_pearl(), make_task_vec_env(ENV_ID, 2, wrapper=OldGenerator), PointRobotFamily().test_tasks[:2]
+    env.reset()
+    ours, theirs = (evaluate_adaptation(model, each, tasks, n_episodes=2) for each in (env, make_task_vec_env(ENV_ID, 2)))
+    np.testing.assert_array_equal(ours, theirs)
+
+
 class Dying(gym.Wrapper[Any, Any, Any, Any]):
     """Its process ends in its first step."""
 
