@@ -323,12 +323,12 @@ def test_z_is_chosen_forty_times_in_an_episode_of_known_length(tiny_pearl: MakeP
     model = tiny_pearl()
     know_tasks(model, 9)
     adaptation, places = begin(model, "belief"), list[float]()
-    for i in range(400):
+    for i in range(480):
         adaptation.explorer.look(np.zeros((1, 2), dtype=np.float32))
         places.append(float(adaptation.z[0, 0]))
-        adaptation.observe(step([[places[-1], 0.0]], [0.0], i % 200 == 199))
+        adaptation.observe(step([[places[-1], 0.0]], [0.0], i in (199, 399, 439, 479)))
     turns = np.flatnonzero(np.diff(places[200:])) + 1
-    assert len(turns) > 20 and (turns % 5 == 0).all()
+    assert len(turns) > 20 and (turns % 5 == 0).all(), "after short ones, too"
 
 
 def test_it_repeats_the_best_episode_unless_another_task_promises_more(tiny_pearl: MakePEARL) -> None:
@@ -397,17 +397,27 @@ def test_the_posterior_of_a_better_episode_is_tried_once(tiny_pearl: MakePEARL) 
 
 
 @pytest.mark.parametrize(
-    ("explorer", "growth", "turns"),
-    [("belief", 1.0, True), ("belief", 1 / 0.9, False), (ABLATIONS["belief, no giving up"], 1.0, False)],
+    ("explorer", "worth", "growth", "turns"),
+    [
+        ("belief", 1.0, 1.0, True),
+        ("belief", 1.0, 1 / 0.9, False),
+        # Which promises nothing that could be kept
+        ("belief", -1.0, 1.0, False),
+        (ABLATIONS["belief, no giving up"], 1.0, 1.0, False),
+    ],
 )
 def test_an_episode_whose_value_does_not_grow_searches_on(
-    tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch, explorer: str | Explorer, growth: float, turns: bool
+    tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch, explorer: str | Explorer, worth: float, growth: float, turns: bool
 ) -> None:
-    """A z that was good may lead nowhere from where this one begins. On the way to a reward, values grow by 1 / gamma."""
+    """
+    A z that was good may lead nowhere from where this one begins. On the way to a reward, values grow by 1 / gamma, less that
+    of unrewarded steps.
+    """
     model = tiny_pearl(gamma=0.9)
     know_tasks(model, 8)
-    values = [1.0]
-    monkeypatch.setattr(model.policy, "values", lambda obs, z: th.full(z.shape[:2], values[0]))
+    model.knowledge.task_free_value.fill_(-7.0)
+    values = [worth]
+    monkeypatch.setattr(model.policy, "values", lambda obs, z: th.full(z.shape[:2], values[0] - 7.0))
     adaptation = begin(model, explorer)
     found = play(adaptation, [[5.0], [5.0], [5.0]])[-1]
     z = []
@@ -529,6 +539,20 @@ def test_it_goes_for_what_is_likely_though_the_critics_value_another_a_little_mo
     adaptation = begin(model, "belief")
     adaptation.act(np.zeros((1, 2), dtype=np.float32))
     np.testing.assert_array_equal(adaptation.z, known[:1])
+
+
+@pytest.mark.parametrize("reward", [0.5, 5.0])
+def test_two_searches_that_end_in_vain_tell_against_their_aim_whatever_it_pays(tiny_pearl: MakePEARL, reward: float) -> None:
+    model = tiny_pearl()
+    sure_of_the_first(model)
+    model.knowledge.gain *= reward / 5
+    adaptation = begin(model, Belief(temperature=0.0))
+    explorer = adaptation.explorer
+    assert isinstance(explorer, Belief)
+    for doubts in (1, 0.005 / 0.995):
+        play(adaptation, [[0.0]])
+        weights = explorer.weights(np.arange(1))[0]
+        assert (weights[0] / weights[1]).item() == pytest.approx(np.exp(4) * doubts, rel=1e-4)
 
 
 def test_it_goes_for_the_episode_that_earns_most_under_the_likely_task(
