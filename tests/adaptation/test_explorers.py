@@ -96,6 +96,22 @@ def test_where_nothing_happened_yet_there_is_nothing_to_infer(tiny_pearl: MakePE
     assert (known[0] != unknown[0]).all()
 
 
+def test_a_reward_of_the_task_is_what_the_model_does_not_call_task_free(tiny_pearl: MakePEARL) -> None:
+    """The model sees observations as it learnt by them."""
+    model = tiny_pearl()
+    model.policy.update_normalizer(np.array([[0.0, 0.0], [8.0, 2.0]]))
+    model.knowledge.threshold.fill_(-100.0)
+    adaptation = begin(model, "prior")
+    taken = step([[3.0, 0.5]], [1.0], True)
+    adaptation.observe(taken)
+    with th.no_grad():
+        normal = model.policy.normalize(th.from_numpy(taken.observations))
+        free = model.policy.reward_model.task_free(normal, th.from_numpy(taken.actions), normal)
+    np.testing.assert_allclose(adaptation.task_reward, 1 - free.numpy(), rtol=1e-5)
+    adaptation.observe(taken._replace(rewards=np.array([-9.0])))
+    np.testing.assert_allclose(adaptation.best_return, 1 - free.numpy(), rtol=1e-5, err_msg="that of the better episode")
+
+
 @pytest.fixture(scope="module")
 def known() -> Any:
     """Models that know so many tasks, made once."""
