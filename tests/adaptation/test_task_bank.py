@@ -300,6 +300,10 @@ def test_what_is_known_of_solved_tasks_is_that_of_the_docstrings(tiny_pearl: Mak
     # 1 / 1.25 for those that the first is like, 1 / 5 for two units from a training task
     th.testing.assert_close(particles.log_prior.exp(), th.tensor([1, 0.8, 0.2]) / 2, atol=1e-4, rtol=0)
     assert model.knowledge.threshold.item() == pytest.approx(0.5, abs=0.02), "between nothing and the smallest reward"
+    monkeypatch.setattr(model.policy.reward_model, "task_free", lambda *_: th.arange(-6.0, 0.0))
+    with th.no_grad():
+        model.knowledge._solved(model.policy, bank, gamma=0.9)
+    assert model.knowledge.task_free_value.item() == pytest.approx(-35), "of -3.5 a step, discounted"
 
 
 @pytest.mark.parametrize("stop", [-10.0, 10.0])
