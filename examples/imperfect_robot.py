@@ -62,6 +62,7 @@ IMPERFECTIONS = {
     "rewards: false in one step of 1,000": Imperfection(false=0.001),
     "rewards: false in one step of 100": Imperfection(false=0.01),
     "rewards: noise of .05": Imperfection(reward_noise=0.05),
+    "rewards: noise of .1": Imperfection(reward_noise=0.1),
     "rewards: noise of .2": Imperfection(reward_noise=0.2),
 }
 

@@ -18,7 +18,8 @@ from sb3_htr.zoo.run.method import OWN
 
 RESULTS = Path(__file__).parents[1] / "results"
 DOCS = RESULTS.parent / "docs"
-DOCUMENTS = (RESULTS.parent / "README.md", *sorted(DOCS.glob("results/*.md")), DOCS / "performance.md")
+PAGES = (DOCS / "performance.md", DOCS / "real_robot.md")
+DOCUMENTS = (RESULTS.parent / "README.md", *sorted(DOCS.glob("results/*.md")), *PAGES)
 # The table of README.md: envs in words and tasks that are further away, by experiments; heads, methods, whether of such tasks
 SHORT: dict[str, tuple[str, str | None]] = {
     "point_robot": ("Point robot", "goal distance 1.4"),
@@ -207,6 +208,18 @@ def _interval(row: dict[str, Any]) -> str:
     return numbers(row, 1)
 
 
+def imperfections(lines: str) -> str:
+    """
+    :param lines: what ``examples/imperfect_robot.py`` prints of some envs
+    :return: a table with a column for each env
+    """
+    head, *rows = (line.strip("| ").split(" | ") for line in lines.splitlines() if "---" not in line)
+    found = {(env, kind): scores for env, kind, *scores in rows if env != head[0]}
+    envs, kinds = (list(dict.fromkeys(names)) for names in zip(*found, strict=True))
+    shown = [[kind, *("{}; {}, {}".format(*found[env, kind]) for env in envs)] for kind in kinds]
+    return markdown_table([head[1], *envs], shown) + "\n"
+
+
 def filled(text: str, tables: dict[str, str], page: object = "The document") -> str:
     """
     :param text: of a document
@@ -247,6 +260,7 @@ def tables() -> dict[str, str]:
     headlines = {name: headline(by_name, methods_of) for name, methods_of in HEADLINES.items()}
     headlines["headline:short"] = short(by_name)
     headlines["headline:rivals"] = rivals(by_name["rivals"])
+    headlines["imperfections"] = imperfections((RESULTS / "imperfect_robot.md").read_text())
     return {**own, **headlines, **{name: differences(by_name, methods_of) for name, methods_of in COMPARED.items()}}
 
 
