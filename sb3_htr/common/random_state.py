@@ -59,8 +59,16 @@ def get_env_states(env: VecEnv) -> list[str]:
     """
     :param env: of gymnasium's envs
     :return: state of the generator of each
+    :raises ValueError: for a generator of another kind than gymnasium's
     """
-    return [get_generator_state(generator) for generator in env.get_attr("np_random")]
+    generators = env.get_attr("np_random")
+    for generator in generators:
+        if not isinstance(generator, np.random.Generator):
+            raise ValueError(
+                f"The env's np_random is a {type(generator).__name__}, expected numpy's Generator, whose state is kept: "
+                "leave it to gymnasium.Env.reset(seed=...), which makes one."
+            )
+    return [get_generator_state(generator) for generator in generators]
 
 
 def set_env_states(env: VecEnv, states: list[str]) -> None:

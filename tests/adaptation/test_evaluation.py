@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -21,6 +22,7 @@ from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.adaptation import Adaptation, Belief, Prior, Step, evaluation
 from sb3_htr.adaptation.callbacks import MetaEvalCallback
 from sb3_htr.adaptation.evaluation import record_adaptation
+from sb3_htr.common.checkpoint_callback import CheckpointCallback
 from sb3_htr.common.random_state import get_env_states
 from sb3_htr.common.vec_env import BatchedTaskVecEnv, make_task_vec_env, reset_to_tasks
 from sb3_htr.rivals.scripted import ScriptedAgent
@@ -306,6 +308,13 @@ def test_envs_whose_generator_is_an_old_one_are_evaluated_in_as_well(tiny_pearl:
     env.reset()
     ours, theirs = (evaluate_adaptation(model, each, tasks, n_episodes=2) for each in (env, make_task_vec_env(ENV_ID, 2)))
     np.testing.assert_array_equal(ours, theirs)
+
+
+def test_a_training_in_them_that_could_not_go_on_is_refused_at_once(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    model = tiny_pearl(make_task_vec_env(ENV_ID, 2, wrapper=OldGenerator))
+    with pytest.raises(ValueError, match=r"np_random is a RandomState, expected numpy's Generator, .*: leave it to gymnasium"):
+        model.learn(ROLLOUT, CheckpointCallback(1, str(tmp_path)))
+    assert model.num_timesteps == 0
 
 
 class Dying(gym.Wrapper[Any, Any, Any, Any]):
