@@ -211,9 +211,9 @@ class Adaptation:
             task_free = policy.reward_model.task_free(policy.normalize(obs), action, policy.normalize(next_obs))
         beside = step.rewards - task_free.cpu().numpy()
         self.largest_reward = np.maximum(self.largest_reward, beside)
-        if self._watch is not None:
-            self._watch.check(beside, np.asarray(step.dones, dtype=bool))
-        return np.where(beside > self.knowledge.threshold.item(), beside, 0.0)
+        if self._watch is None:
+            return np.where(beside > self.knowledge.threshold.item(), beside, 0.0)
+        return np.where(self._watch.rewarded(beside, np.asarray(step.dones, dtype=bool)), beside, 0.0)
 
     def _remember(self, *columns: np.ndarray) -> None:
         if not self._running:

@@ -1,15 +1,19 @@
-"""Notices at meta-test that rewards are given otherwise than in meta-training."""
+"""Which steps are rewarded at meta-test, and whether rewards are given otherwise there than in meta-training."""
 
 import numpy as np
 
+from sb3_htr.adaptation.reward_noise import RewardNoise
 from sb3_htr.common.warn_once import WarnOnce
 
 # Times what a success is worth: that of one step may be more than their mean, but not by so much
 LARGER = 5.0
+# Standard deviations by which a reward must be more than noise, one step of 30,000. By measurement, docs/real_robot.md
+CERTAIN = 4.0
 
 
 class RewardWatch:
     """
+    Tells which steps are rewarded: those above the threshold of meta-training, and above the noise of this robot's rewards.
     Warns, once each, of rewards that are too large, and of those by which a success cannot be told.
 
     Where a goal is reached for 0 in place of -1, the agent would take all that it does for a failure, and where each step
@@ -23,6 +27,8 @@ class RewardWatch:
     def __init__(self, n_envs: int, threshold: float, worth: float) -> None:
         self._threshold = threshold
         self._worth = worth
+        # Where a success may be below 0, meta-training has not learnt what steps without it return
+        self._noise = RewardNoise(n_envs, threshold) if threshold > 0 else None
         self._sum = np.zeros(n_envs)
         self._n_steps = np.zeros(n_envs, dtype=np.int64)
         # Of all steps so far; of one env alone, they may be successes
@@ -30,11 +36,30 @@ class RewardWatch:
         self._has_ended = np.zeros(n_envs, dtype=bool)
         self._warn_once = WarnOnce()
 
-    def check(self, beside: np.ndarray, dones: np.ndarray) -> None:
+    def rewarded(self, beside: np.ndarray, dones: np.ndarray) -> np.ndarray:
         """
         :param beside: (n_envs,), what a step of each env returned beside what the model says of steps without success
         :param dones: (n_envs,) bool, where an episode ended
+        :return: (n_envs,) bool, which of these steps are rewarded
         """
+        self._check(beside, dones)
+        if self._noise is None:
+            return np.asarray(beside > self._threshold)
+        certain = CERTAIN * self._noise.deviation
+        if 2 * (largest := self._noise.deviation.max()) > self._worth:
+            self._warn_once(
+                "noise",
+                f"The rewards of steps without success have a standard deviation of {largest:.2g}, among which a success of "
+                f"up to {self._worth:.2g} can hardly be told: filter them, or pay for what is sure.",
+                stacklevel=4,
+            )
+        # A step that returns as much as a success does passes for one, however large the noise is
+        threshold = np.clip(certain, self._threshold, self._worth)
+        is_rewarded = np.asarray(beside > threshold)
+        self._noise.observe(beside, ~is_rewarded)
+        return is_rewarded
+
+    def _check(self, beside: np.ndarray, dones: np.ndarray) -> None:
         if (largest := beside.max()) > LARGER * self._worth:
             self._warn("A step", largest, f"up to about {self._worth:.2g}")
         self._sum += beside

@@ -54,15 +54,15 @@ def test_steps_that_return_what_they_should_are_not_warned_of_where_a_success_ma
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         watch = RewardWatch(2, threshold=-0.5, worth=0.5)
-        watch.check(np.zeros(2), np.array([True, False]))
-        watch.check(np.zeros(2), np.array([True, True]))
+        watch.rewarded(np.zeros(2), np.array([True, False]))
+        watch.rewarded(np.zeros(2), np.array([True, True]))
 
 
 def test_each_episode_has_a_mean_of_its_own() -> None:
     watch, ended = RewardWatch(1, threshold=0.5, worth=1.0), np.array([True])
-    watch.check(np.array([1.0]), ended)
+    watch.rewarded(np.array([1.0]), ended)
     with pytest.warns(UserWarning, match="On average, the steps of an episode returned -1 more"):
-        watch.check(np.array([-1.0]), ended)
+        watch.rewarded(np.array([-1.0]), ended)
 
 
 def test_rewards_are_warned_of_when_enough_of_them_was_seen() -> None:
@@ -71,13 +71,13 @@ def test_rewards_are_warned_of_when_enough_of_them_was_seen() -> None:
     watch, of_one_step = (RewardWatch(2, threshold=0.5, worth=1.0) for _ in range(2))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        of_one_step.check(rewarded, first | second)
-        watch.check(rewarded, nobody)
-        watch.check(np.array([4.9, 1.0]), first)
+        of_one_step.rewarded(rewarded, first | second)
+        watch.rewarded(rewarded, nobody)
+        watch.rewarded(np.array([4.9, 1.0]), first)
     with pytest.warns(UserWarning, match="Each step returned 1 more"):
-        watch.check(rewarded, second)
+        watch.rewarded(rewarded, second)
     with pytest.warns(UserWarning, match=r"A step returned 5\.1 more .*, expected up to about 1:"):
-        watch.check(np.array([5.1, 1.0]), nobody)
+        watch.rewarded(np.array([5.1, 1.0]), nobody)
 
 
 def test_rewards_that_no_network_could_take_are_refused() -> None:

@@ -1,0 +1,40 @@
+"""How much the rewards of steps without success vary at meta-test, as those that a sensor measures do."""
+
+import numpy as np
+
+# In thresholds: what differs less is the same, and what is further from 0 than this is as far
+WIDTH, FARTHEST = 1 / 16, 4.0
+# Before so many steps of an env, nothing is said of it. Our choice
+MIN_STEPS = 16
+
+
+class RewardNoise:
+    """
+    Estimates the standard deviation of what steps without success return, of each env by its own steps.
+
+    It is the distance from the median to the quantiles of .16 and .84, the smaller one, so that neither an offset counts as
+    noise, nor a penalty, however many of the steps have it.
+
+    :param n_envs: number of envs
+    :param threshold: above 0, what a success returns more than
+    """
+
+    def __init__(self, n_envs: int, threshold: float) -> None:
+        self._width = WIDTH * threshold
+        self._n_bins = 2 * round(FARTHEST / WIDTH) + 1
+        self._counts = np.zeros((n_envs, self._n_bins), dtype=np.int64)
+        #: (n_envs,), in steps of a sixteenth of the threshold
+        self.deviation = np.zeros(n_envs)
+
+    def observe(self, beside: np.ndarray, unrewarded: np.ndarray) -> None:
+        """
+        :param beside: (n_envs,), what a step of each env returned beside what the model says of steps without success
+        :param unrewarded: (n_envs,) bool, envs whose step had none
+        """
+        envs, last = np.flatnonzero(unrewarded), self._n_bins - 1
+        self._counts[envs, np.clip(np.rint(beside[envs] / self._width) + last // 2, 0, last).astype(np.int64)] += 1
+        below = self._counts[envs].cumsum(axis=1)
+        n_steps = below[:, -1:]
+        low, median, high = ((below >= share * n_steps).argmax(axis=1) for share in (0.16, 0.5, 0.84))
+        least = np.minimum(median - low, high - median)
+        self.deviation[envs] = np.where(n_steps[:, 0] < MIN_STEPS, 0.0, self._width * least)

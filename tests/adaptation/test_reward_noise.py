@@ -1,0 +1,73 @@
+"""What a sensor adds to rewards is not taken for a success, and nothing else is taken for noise."""
+
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sb3_htr.adaptation.reward_noise import RewardNoise
+from sb3_htr.adaptation.reward_watch import RewardWatch
+
+THRESHOLD, WORTH = 0.3, 0.9
+
+
+def estimate(beside: np.ndarray, unrewarded: np.ndarray | None = None) -> np.ndarray:
+    """From steps (n, n_envs)."""
+    noise = RewardNoise(beside.shape[1], THRESHOLD)
+    for step, counts in zip(beside, np.ones_like(beside, dtype=bool) if unrewarded is None else unrewarded, strict=True):
+        noise.observe(step, counts)
+    return noise.deviation
+
+
+@given(scale=st.floats(0.1, 0.5), offset=st.floats(-0.5, 0.5), seed=st.integers(0, 2**31))
+def test_noise_is_estimated_beside_an_offset_of_each_env_alone(scale: float, offset: float, seed: int) -> None:
+    noise = np.random.default_rng(seed).normal(size=(1000, 2))
+    noisy, calm = estimate(offset + noise * [scale, 0])
+    assert abs(noisy - scale) < 0.25 * scale + THRESHOLD / 10
+    assert calm == 0
+
+
+@given(offset=st.floats(-0.5, 0.5), penalty=st.floats(-50, -0.1), share=st.floats(0, 1))
+def test_a_penalty_is_no_noise(offset: float, penalty: float, share: float) -> None:
+    steps = np.full((1000, 1), offset)
+    steps[: int(share * 1000)] += penalty
+    assert estimate(np.random.default_rng(0).permutation(steps)) == 0
+
+
+def test_successes_and_the_first_steps_do_not_count() -> None:
+    rng = np.random.default_rng(0)
+    steps = np.where(np.arange(200)[:, None] % 3, rng.normal(0.9, 0.2, size=(200, 1)), 0)
+    assert estimate(steps, steps == 0) == 0 < estimate(steps)
+    assert estimate(rng.normal(size=(15, 3))).tolist() == [0, 0, 0]
+    assert (estimate(rng.normal(size=(16, 3))) > 0).all()
+
+
+def told(watch: RewardWatch, beside: np.ndarray) -> np.ndarray:
+    """Which of the steps (n, n_envs) of an episode are rewarded."""
+    dones = np.zeros(beside.shape[1], dtype=bool)
+    return np.stack([watch.rewarded(step, dones) for step in beside])
+
+
+@pytest.mark.parametrize("scale", [0.15, 0.2])
+def test_what_is_noise_is_not_rewarded_and_what_is_none_is(scale: float) -> None:
+    rng, watch = np.random.default_rng(0), RewardWatch(4, THRESHOLD, WORTH)
+    without = told(watch, rng.normal(scale=scale, size=(400, 4)))
+    assert without[100:].mean() < 0.001 < 0.02 < (rng.normal(scale=scale, size=100_000) > THRESHOLD).mean()
+    assert told(watch, WORTH + rng.normal(scale=scale, size=(50, 4))).mean() > 0.6
+
+
+def test_without_noise_the_threshold_is_that_of_training() -> None:
+    steps = np.random.default_rng(0).choice([0.0, -0.01, 0.01, 0.29, 0.31, 0.9], size=(500, 3))
+    np.testing.assert_array_equal(told(RewardWatch(3, THRESHOLD, WORTH), steps), steps > THRESHOLD)
+
+
+def test_noise_that_hides_successes_is_warned_of() -> None:
+    steps = np.random.default_rng(0).normal(size=(100, 2)) * [0.2, 0.7]
+    with pytest.warns(UserWarning, match=r"standard deviation of 0\.\d+, among which a success of up to 0\.9 can") as caught:
+        told(RewardWatch(2, THRESHOLD, WORTH), steps)
+    assert len([warning for warning in caught if "deviation" in str(warning.message)]) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        told(RewardWatch(1, THRESHOLD, WORTH), steps[:, :1])
