@@ -5,7 +5,7 @@ import numpy as np
 # In thresholds: what differs less is the same, and what is further from 0 than this is as far
 WIDTH, FARTHEST = 1 / 16, 4.0
 # Before so many steps of an env, nothing is said of it. Our choice
-MIN_STEPS = 16
+MIN_STEPS = 40
 
 
 class RewardNoise:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sb3_htr.adaptation.reward_noise import RewardNoise
+from sb3_htr.adaptation.reward_noise import MIN_STEPS, RewardNoise
 from sb3_htr.adaptation.reward_watch import RewardWatch
 
 THRESHOLD, WORTH = 0.3, 0.9
@@ -40,8 +40,8 @@ def test_successes_and_the_first_steps_do_not_count() -> None:
     rng = np.random.default_rng(0)
     steps = np.where(np.arange(200)[:, None] % 3, rng.normal(0.9, 0.2, size=(200, 1)), 0)
     assert estimate(steps, steps == 0) == 0 < estimate(steps)
-    assert estimate(rng.normal(size=(15, 3))).tolist() == [0, 0, 0]
-    assert (estimate(rng.normal(size=(16, 3))) > 0).all()
+    assert estimate(rng.normal(size=(MIN_STEPS - 1, 3))).tolist() == [0, 0, 0]
+    assert (estimate(rng.normal(size=(MIN_STEPS, 3))) > 0).all()
 
 
 def told(watch: RewardWatch, beside: np.ndarray) -> np.ndarray:
