@@ -7,7 +7,7 @@ from sb3_htr.common.warn_once import WarnOnce
 
 # Times what a success is worth: that of one step may be more than their mean, but not by so much
 LARGER = 5.0
-# Standard deviations by which a reward must be more than noise, one step of 30,000. By measurement, docs/real_robot.md
+# Standard deviations by which a reward must be more than noise, which that is in one step of 30,000. Our choice
 CERTAIN = 4.0
 
 
