@@ -1,5 +1,5 @@
 """How well an agent adapts where sensors, motors and measured rewards are not those of its simulation:
-``python -m examples.imperfect_robot SparsePointRobot-v0 [agent.zip]``.
+``python -m examples.imperfect_robot [ENV [agent.zip]]``.
 
 By the explorer of the agent, of the package by default, on the 20 validation tasks with three seeds each. What counts as
 solved is the truth, not what the sensors say.
@@ -106,7 +106,7 @@ class ImperfectRobot(VecEnvWrapper):
         return (obs + noise).astype(np.float32)
 
 
-def main(env_id: str, agent: str = "") -> None:
+def main(env_id: str = "SparsePointRobot-v0", agent: str = "") -> None:
     """A line for each imperfection."""
     model = PEARL.load(agent) if agent else agent_for(env_id).load()
     normalizer = model.policy.normalizer
