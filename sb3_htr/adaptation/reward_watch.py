@@ -78,5 +78,5 @@ class RewardWatch:
             what,
             f"{what} returned {value:.2g} more than meta-training has taught of steps without success, expected "
             f"{expected}: give rewards as in meta-training, or the agent cannot make sense of them.",
-            stacklevel=5,
+            stacklevel=6,
         )

@@ -45,8 +45,9 @@ def test_rewards_unlike_those_of_training_are_warned_of(given: Callable[[float],
 def test_ends_of_episodes_may_be_numbers() -> None:
     adaptation = PEARL.load(SHIPPED).start_adaptation(3)
     obs = np.zeros((3, 2), dtype=np.float32)
-    with pytest.warns(UserWarning, match="On average, the steps of an episode returned -1"):
+    with pytest.warns(UserWarning, match="On average, the steps of an episode returned -1") as caught:
         adaptation.observe(Step(obs, obs, np.array([0.0, 0.0, -1.0]), obs, np.array([0, 0, 1])))
+    assert caught[0].filename == __file__
 
 
 def test_steps_that_return_what_they_should_are_not_warned_of_where_a_success_may_be_below_0() -> None:
