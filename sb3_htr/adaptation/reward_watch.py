@@ -9,6 +9,8 @@ from sb3_htr.common.warn_once import WarnOnce
 LARGER = 5.0
 # Standard deviations by which a reward must be more than noise, which that is in one step of 30,000. Our choice
 CERTAIN = 4.0
+# By which one is to be less, to count as one without success: between the two, it may be a success that noise made small
+LIKELY = 2.5
 
 
 class RewardWatch:
@@ -45,8 +47,8 @@ class RewardWatch:
         self._check(beside, dones)
         if self._noise is None:
             return np.asarray(beside > self._threshold)
-        certain = CERTAIN * self._noise.deviation
-        if 2 * (largest := self._noise.deviation.max()) > self._worth:
+        deviation = self._noise.deviation
+        if 2 * (largest := deviation.max()) > self._worth:
             self._warn_once(
                 "noise",
                 f"The rewards of steps without success have a standard deviation of {largest:.2g}, among which a success of "
@@ -54,10 +56,9 @@ class RewardWatch:
                 stacklevel=4,
             )
         # A step that returns as much as a success does passes for one, however large the noise is
-        threshold = np.clip(certain, self._threshold, self._worth)
-        is_rewarded = np.asarray(beside > threshold)
-        self._noise.observe(beside, ~is_rewarded)
-        return is_rewarded
+        likely, certain = (np.clip(times * deviation, self._threshold, self._worth) for times in (LIKELY, CERTAIN))
+        self._noise.observe(beside, beside <= likely)
+        return np.asarray(beside > certain)
 
     def _check(self, beside: np.ndarray, dones: np.ndarray) -> None:
         if (largest := beside.max()) > LARGER * self._worth:

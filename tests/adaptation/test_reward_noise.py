@@ -58,6 +58,15 @@ def test_what_is_noise_is_not_rewarded_and_what_is_none_is(scale: float) -> None
     assert told(watch, WORTH + rng.normal(scale=scale, size=(50, 4))).mean() > 0.6
 
 
+def test_successes_that_noise_makes_small_do_not_hide_the_others() -> None:
+    """However long an agent stays where it succeeds."""
+    rng, watch = np.random.default_rng(0), RewardWatch(10, THRESHOLD, WORTH)
+    told(watch, rng.normal(scale=0.2, size=(800, 10)))
+    is_there = np.arange(3000) % 3 > 0
+    steps = WORTH * is_there[:, None] + rng.normal(scale=0.2, size=(3000, 10))
+    assert told(watch, steps)[is_there][-500:].mean() > 0.65
+
+
 def test_without_noise_the_threshold_is_that_of_training() -> None:
     steps = np.random.default_rng(0).choice([0.0, -0.01, 0.01, 0.29, 0.31, 0.9], size=(500, 3))
     np.testing.assert_array_equal(told(RewardWatch(3, THRESHOLD, WORTH), steps), steps > THRESHOLD)
