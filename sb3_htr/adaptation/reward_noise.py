@@ -25,6 +25,8 @@ class RewardNoise:
         self._counts = np.zeros((n_envs, self._n_bins), dtype=np.int64)
         #: (n_envs,), in steps of a sixteenth of the threshold
         self.deviation = np.zeros(n_envs)
+        #: (n_envs,), 0 or less: the median, where costs are larger than the model says
+        self.level = np.zeros(n_envs)
 
     def observe(self, beside: np.ndarray, unrewarded: np.ndarray) -> None:
         """
@@ -37,4 +39,5 @@ class RewardNoise:
         n_steps = below[:, -1:]
         low, median, high = ((below >= share * n_steps).argmax(axis=1) for share in (0.16, 0.5, 0.84))
         least = np.minimum(median - low, high - median)
+        self.level[envs] = self._width * np.minimum(median - last // 2, 0)
         self.deviation[envs] = np.where(n_steps[:, 0] < MIN_STEPS, 0.0, self._width * least)

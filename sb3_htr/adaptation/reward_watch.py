@@ -47,7 +47,7 @@ class RewardWatch:
         self._check(beside, dones)
         if self._noise is None:
             return np.asarray(beside > self._threshold)
-        deviation = self._noise.deviation
+        level, deviation = self._noise.level, self._noise.deviation
         if 2 * (largest := deviation.max()) > self._worth:
             self._warn_once(
                 "noise",
@@ -56,7 +56,7 @@ class RewardWatch:
                 stacklevel=4,
             )
         # A step that returns as much as a success does passes for one, however large the noise is
-        likely, certain = (np.clip(times * deviation, self._threshold, self._worth) for times in (LIKELY, CERTAIN))
+        likely, certain = (np.clip(level + times * deviation, self._threshold, self._worth) for times in (LIKELY, CERTAIN))
         self._noise.observe(beside, beside <= likely)
         return np.asarray(beside > certain)
 

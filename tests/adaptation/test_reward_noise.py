@@ -1,6 +1,8 @@
 """What a sensor adds to rewards is not taken for a success, and nothing else is taken for noise."""
 
 import warnings
+from collections.abc import Callable
+from typing import TypeAlias
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from sb3_htr.adaptation.reward_noise import MIN_STEPS, RewardNoise
 from sb3_htr.adaptation.reward_watch import RewardWatch
 
 THRESHOLD, WORTH = 0.3, 0.9
+Cost: TypeAlias = Callable[[np.random.Generator, int], np.ndarray]
 
 
 def estimate(beside: np.ndarray, unrewarded: np.ndarray | None = None) -> np.ndarray:
@@ -65,6 +68,14 @@ def test_successes_that_noise_makes_small_do_not_hide_the_others() -> None:
     is_there = np.arange(3000) % 3 > 0
     steps = WORTH * is_there[:, None] + rng.normal(scale=0.2, size=(3000, 10))
     assert told(watch, steps)[is_there][-500:].mean() > 0.65
+
+
+@pytest.mark.parametrize("cost", [lambda rng, n: rng.uniform(0, 0.6, (n, 1)), lambda rng, n: rng.normal(0.4, 0.15, (n, 1))])
+def test_where_steps_cost_more_than_in_training_a_success_is_told_by_what_they_cost(cost: Cost) -> None:
+    """It need not be above what costs vary by, but above what steps return without it."""
+    rng, watch = np.random.default_rng(0), RewardWatch(1, THRESHOLD, WORTH)
+    assert told(watch, -cost(rng, 400)).mean() < 0.001
+    assert told(watch, WORTH - cost(rng, 100)).mean() > 0.55
 
 
 def test_without_noise_the_threshold_is_that_of_training() -> None:
