@@ -85,9 +85,10 @@ class ImperfectRobot(VecEnvWrapper):
         return self._seen(np.asarray(self.venv.reset()))
 
     def step_async(self, actions: np.ndarray) -> None:
-        noise = self.imperfection.action_noise * self.rng.normal(size=actions.shape)
+        low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
+        noise = self.imperfection.action_noise * (high - low) / 2 * self.rng.normal(size=actions.shape)
         self.late.extend([np.zeros_like(actions)] * (self.imperfection.delay - len(self.late)))  # at the beginning
-        self.late.append(np.clip(self.imperfection.gain * actions + noise, -1, 1).astype(np.float32))
+        self.late.append(np.clip(self.imperfection.gain * actions + noise, low, high).astype(np.float32))
         self.venv.step_async(self.late.popleft())
 
     def step_wait(self) -> VecEnvStepReturn:

@@ -5,6 +5,7 @@ import importlib
 import inspect
 import json
 import runpy
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from gymnasium.error import DependencyNotInstalled
 from helpers import TINY, with_policy
 from htr_envs import check_task_env
 from sb3_htr import PEARL
+from sb3_htr.common.vec_env import make_task_vec_env
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 FAMILIES = {
@@ -63,6 +65,27 @@ def test_what_breaks_a_robot_breaks_adaptation(monkeypatch: pytest.MonkeyPatch, 
     assert len(rows) == 8 and rows[0][1:] == ["none", rows[0][2], "1.00", "1.00"]
     assert rows[1][2:] == ["21.0", "0.00", "0.00"], "one that stands still"
     assert all(float(row[-1]) < 0.8 for row in rows[1:]), rows
+
+
+def test_noise_of_actions_is_in_the_scale_of_the_env() -> None:
+    example = importlib.import_module("examples.imperfect_robot")
+
+    class Wide(gym.ActionWrapper[Any, Any, Any]):
+        def __init__(self, env: gym.Env[Any, Any], times: float) -> None:
+            super().__init__(env)
+            self.times = np.float32(times)
+            self.action_space = gym.spaces.Box(-self.times, self.times, (2,), np.float32)
+
+        def action(self, action: Any) -> Any:
+            return action / self.times
+
+    paths = []
+    for times in (1, 4):
+        env = make_task_vec_env("SparsePointRobot-v0", 2, 0, wrapper=partial(Wide, times=times))
+        robots = example.ImperfectRobot(env, example.Imperfection(action_noise=0.3), np.zeros(2), 0)
+        robots.reset()
+        paths.append([robots.step(np.full((2, 2), 0.5 * times, dtype=np.float32))[0] for _ in range(5)])
+    np.testing.assert_allclose(paths[0], paths[1], rtol=1e-5)
 
 
 DENSE = {
