@@ -229,8 +229,11 @@ def test_a_process_ends_that_could_make_some_of_its_envs_alone(how: str) -> None
             time.sleep(60)
         return env
 
-    kwargs = {"wrapper": make, "vec_env_class": ForkedVecEnv}
-    process = get_context("fork").Process(target=make_task_vec_env, args=[ENV_ID, 2], kwargs=kwargs)
+    def make_two() -> None:
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # which tests in the background do not have
+        make_task_vec_env(ENV_ID, 2, wrapper=make, vec_env_class=ForkedVecEnv)
+
+    process = get_context("fork").Process(target=make_two)
     process.start()
     process.join(30)
     process.kill()
