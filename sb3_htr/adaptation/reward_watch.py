@@ -9,7 +9,8 @@ from sb3_htr.common.warn_once import WarnOnce
 LARGER = 5.0
 # Standard deviations by which a reward must be more than noise, which that is in one step of 30,000. Our choice
 CERTAIN = 4.0
-# By which one is to be less, to count as one without success: between the two, it may be a success that noise made small
+# By which one is to be less, to count as one without success: between the two, it may be a success that noise made small. Our
+# choice, by drawn rewards
 LIKELY = 2.5
 
 
