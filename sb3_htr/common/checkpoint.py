@@ -74,6 +74,7 @@ def read_checkpoint(folder: str | os.PathLike[str]) -> dict[str, Any]:
     :param folder: of :func:`write_checkpoint`
     :return: the state, on the CPU
     :raises DamagedCheckpoint: if it is incomplete, changed, or of another format
+    :raises MemoryError: if there is too little memory for it
     """
     folder = Path(folder)
     try:
@@ -92,7 +93,10 @@ def read_checkpoint(folder: str | os.PathLike[str]) -> dict[str, Any]:
         raise DamagedCheckpoint(f"{folder / STATE} is missing or not what was written: the checkpoint is damaged.")
     try:
         state: dict[str, Any] = th.load(folder / STATE, map_location="cpu", weights_only=True)
-    except Exception:  # whatever a stranger can put into a file, with its checksum beside it
+    except Exception as error:  # whatever a stranger can put into a file, with its checksum beside it
+        # Of which torch has no exception of its own
+        if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
+            raise MemoryError(f"There is too little memory to read {folder / STATE}: free some, and resume again.") from None
         raise DamagedCheckpoint(f"{folder / STATE} is not what sb3-htr writes, and may run code: it was not read.") from None
     return state
 
@@ -127,6 +131,7 @@ def load_latest(run: Path) -> tuple[Path, dict[str, Any]]:
     :param run: folder of a run
     :return: the latest checkpoint that is whole, and its state; those that are not are warned of
     :raises FileNotFoundError: if there is none
+    :raises MemoryError: if there is too little memory for it
     """
     for folder in checkpoints(run):
         try:

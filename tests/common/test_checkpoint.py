@@ -7,6 +7,8 @@ import os
 import random
 import stat
 import struct
+import subprocess
+import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +21,7 @@ from helpers.bombs import Bomb
 from helpers.disks import disk
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checkpoint import (
+    CHECKPOINTS,
     MANIFEST,
     STATE,
     DamagedCheckpoint,
@@ -172,6 +175,25 @@ def test_a_damaged_checkpoint_gives_one_sentence_and_the_next_older_one_is_taken
     with warnings.catch_warnings(), pytest.raises(FileNotFoundError, match="no checkpoint to go on from"):
         warnings.simplefilter("ignore")
         load_latest(tmp_path)
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the memory of a process is measured as Linux does")
+def test_too_little_memory_is_no_damage(tmp_path: Path) -> None:
+    """The latest checkpoint is whole: a training that went on from an older one would write over it."""
+    write_checkpoint(tmp_path / CHECKPOINTS / "2_steps", {"ring": th.zeros(3 * 10**7)})
+    write_checkpoint(tmp_path / CHECKPOINTS / "1_steps", {})
+    code = f"""
+import resource, pathlib
+from sb3_htr.common.checkpoint import load_latest
+used = int(pathlib.Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (used + 6 * 10**7,) * 2)
+try:
+    load_latest(pathlib.Path({str(tmp_path)!r}))
+except MemoryError as error:
+    print(error)
+"""
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "too little memory to read" in process.stdout and "2_steps" in process.stdout, process.stderr
 
 
 def test_damage_at_350_places_is_noticed_or_harmless(tmp_path: Path) -> None:
