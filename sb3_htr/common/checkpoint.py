@@ -11,6 +11,7 @@ import torch as th
 
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.digest import sha256
+from sb3_htr.common.errors import memory_for
 from sb3_htr.common.versions import versions
 
 FORMAT = 1
@@ -92,11 +93,11 @@ def read_checkpoint(folder: str | os.PathLike[str]) -> dict[str, Any]:
     if not intact:
         raise DamagedCheckpoint(f"{folder / STATE} is missing or not what was written: the checkpoint is damaged.")
     try:
-        state: dict[str, Any] = th.load(folder / STATE, map_location="cpu", weights_only=True)
-    except Exception as error:  # whatever a stranger can put into a file, with its checksum beside it
-        # Of which torch has no exception of its own
-        if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
-            raise MemoryError(f"There is too little memory to read {folder / STATE}: free some, and resume again.") from None
+        with memory_for(folder / STATE):
+            state: dict[str, Any] = th.load(folder / STATE, map_location="cpu", weights_only=True)
+    except MemoryError:
+        raise
+    except Exception:  # whatever a stranger can put into a file, with its checksum beside it
         raise DamagedCheckpoint(f"{folder / STATE} is not what sb3-htr writes, and may run code: it was not read.") from None
     return state
 

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 # Of a path that cannot be opened, whatever is in the file
 OPEN_ERRORS = (FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError)
@@ -22,6 +23,20 @@ def reason(error: OSError) -> str:
     :return: in a few words
     """
     return error.strerror or last_line(error)
+
+
+@contextmanager
+def memory_for(what: Any) -> Iterator[None]:
+    """
+    :param what: file that is read within, for the message
+    :raises MemoryError: if there is too little memory for it, of which torch has no exception of its own: the file is whole
+    """
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "can't allocate memory" not in str(error):
+            raise
+        raise MemoryError(f"There is too little memory to read {what}: free some, and try again.") from None
 
 
 @contextmanager

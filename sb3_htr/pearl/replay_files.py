@@ -11,6 +11,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_htr.adaptation.task_bank import TaskBank
 from sb3_htr.common.atomic import atomic_path
+from sb3_htr.common.errors import memory_for
 from sb3_htr.common.saving import with_suffix
 from sb3_htr.common.training_state import Resumable
 from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
@@ -43,6 +44,7 @@ class ReplayFiles(Resumable, OffPolicyAlgorithm):
         :param path: file of ``save_replay_buffer``; reading it runs no code
         :param truncate_last_traj: not used, only whole episodes are stored
         :raises ValueError: if it is no such file, or one of a model with other settings
+        :raises MemoryError: if there is too little memory for it
         """
         own_replay, own_task_bank = self._replay()
         file: Any = path if isinstance(path, io.IOBase) else with_suffix(path, ".pt")
@@ -53,7 +55,8 @@ class ReplayFiles(Resumable, OffPolicyAlgorithm):
                     raise EOFError
             if isinstance(file, io.IOBase):
                 file.seek(0)
-            state = th.load(file, weights_only=True)
+            with memory_for(path):
+                state = th.load(file, weights_only=True)
             replay, task_bank = state["replay"], state["task_bank"]
         except (RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError, zipfile.BadZipFile):
             raise ValueError(

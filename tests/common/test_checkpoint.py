@@ -5,6 +5,7 @@ import fcntl
 import json
 import os
 import random
+import shutil
 import stat
 import struct
 import subprocess
@@ -182,18 +183,24 @@ def test_too_little_memory_is_no_damage(tmp_path: Path) -> None:
     """The latest checkpoint is whole: a training that went on from an older one would write over it."""
     write_checkpoint(tmp_path / CHECKPOINTS / "2_steps", {"ring": th.zeros(3 * 10**7)})
     write_checkpoint(tmp_path / CHECKPOINTS / "1_steps", {})
+    shutil.copy(tmp_path / CHECKPOINTS / "2_steps" / STATE, tmp_path / "replay.pt")
     code = f"""
-import resource, pathlib
+import resource, pathlib, htr_envs
+from sb3_htr import PEARL
 from sb3_htr.common.checkpoint import load_latest
+model = PEARL("MlpPolicy", "SparsePointRobot-v0")
 used = int(pathlib.Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (used + 6 * 10**7,) * 2)
-try:
-    load_latest(pathlib.Path({str(tmp_path)!r}))
-except MemoryError as error:
-    print(error)
+for read, path in (load_latest, pathlib.Path({str(tmp_path)!r})), (model.load_replay_buffer, {str(tmp_path / "replay.pt")!r}):
+    try:
+        read(path)
+    except MemoryError as error:
+        print(error)
 """
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "too little memory to read" in process.stdout and "2_steps" in process.stdout, process.stderr
+    of_checkpoint, of_replay = process.stdout.splitlines()
+    assert of_checkpoint.startswith(f"There is too little memory to read {tmp_path / CHECKPOINTS / '2_steps'}"), process.stderr
+    assert of_replay.startswith(f"There is too little memory to read {tmp_path / 'replay.pt'}"), process.stderr
 
 
 def test_damage_at_350_places_is_noticed_or_harmless(tmp_path: Path) -> None:
