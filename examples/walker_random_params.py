@@ -2,8 +2,9 @@
 
     python examples/walker_random_params.py      # meta-train by plain PEARL and adapt; hours on one core
 
-PEARL's walker-rand-params, but for the walker, which is gymnasium's: it acts every four physics steps, theirs every five. The
-reward is the same in all tasks, and old experience says nothing about another body: there is nothing to relabel.
+PEARL's walker-rand-params, but for the walker, which is gymnasium's: it acts every four physics steps, theirs every five; and
+but for contexts, which there have the next observation, too. The reward is the same in all tasks, and old experience says
+nothing about another body: there is nothing to relabel.
 """
 
 from typing import Any, ClassVar
