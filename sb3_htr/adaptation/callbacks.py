@@ -37,7 +37,7 @@ class MetaEvalCallback(EvalCallback):
 
     :param eval_env: env of the task family, VecEnv or registered id
     :param tasks: ``"validation"``, ``"test"``, ``"train"`` or task vectors (n_tasks, task_dim)
-    :param n_eval_episodes: adaptation episodes per task (PEARL's reference: 20)
+    :param n_eval_episodes: adaptation episodes per task (PEARL's reference for the sparse point robot: 20)
     :param explorer: an :class:`sb3_htr.adaptation.Explorer`, its name, or its name and settings; the model's own by default
     :param kwargs: arguments of SB3's ``EvalCallback``
     :raises ValueError: for settings that are none, and at the beginning of a training on this very env, or with a model that

@@ -244,7 +244,7 @@ def evaluate_adaptation(
     :param env: env, VecEnv (its envs adapt side by side, each to a task of its own) or registered id, of
         which as many are made as there are tasks, up to 20
     :param tasks: (n_tasks, task_dim), or ``"train"``, ``"validation"`` or ``"test"`` (default), tasks of the env
-    :param n_episodes: adaptation episodes per task; 20 in PEARL's reference
+    :param n_episodes: adaptation episodes per task; 20 in PEARL's reference, for the sparse point robot
     :param explorer: an :class:`sb3_htr.adaptation.Explorer`, its name, or its name and settings; the model's own by default;
         ``"prior"`` is PEARL's protocol
     :param deterministic: mean actions instead of samples

@@ -39,7 +39,7 @@ class PEARL(OffPolicyMetaAlgorithm):
     One rollout collects whole episodes on ``n_tasks_per_rollout`` training tasks, as many at once as there are envs; then
     follow ``gradient_steps`` updates. The defaults are the fast profile for two CPU cores, found by measurement; seven of them
     follow from the time limit of the env (:func:`sb3_htr.pearl.horizon.settings_for`). The papers' values are in
-    ``hyperparams/pearl_paper.yml`` and given here where they differ.
+    ``hyperparams/pearl_paper.yml`` and given here where they differ, those of PEARL's reference for its sparse point robot.
 
     :param policy: ``"MlpPolicy"`` or a subclass of PEARLPolicy
     :param env: env of a task family (see ``htr_envs.TaskEnv``), VecEnv of such envs, or registered id
@@ -52,7 +52,7 @@ class PEARL(OffPolicyMetaAlgorithm):
         (PEARL's reference: 256)
     :param tau: soft update of the target critics, in (0, 1] (PEARL's reference: 0.005)
     :param gamma: discount in [0, 1], 1 - 2 / T for T steps of an episode by default, within 0.5 and 0.98, 0 for T of 1
-        (PEARL's reference for the sparse point robot: 0.9, which it is there)
+        (PEARL's reference: 0.9, which it is there)
     :param n_steps: steps whose rewards a return counts before the critics' value is asked for. Values reach further back with
         each update, but what was done in these steps counts, whatever the task that it was done for: by measurement, 3 is
         better than 5 on the ant. By default one for every 60 steps of an episode, from 1 to 10 (PEARL's reference: 1)

@@ -21,7 +21,8 @@ class LearnedPrior(FixedExploration, ParticleExplorer):
     tasks, all alike, and with a small share those of hindsight tasks. z is drawn from it for a fixed number of episodes, and
     then from the posterior over all episodes, their misses included. One z an episode.
 
-    :param n_exploration_episodes: 0 or more episodes before the posterior is used (PEARL's reference, num_exp_traj_eval: 5)
+    :param n_exploration_episodes: 0 or more episodes before the posterior is used (PEARL's reference, num_exp_traj_eval: 5 for
+        the sparse point robot, 1 or 2 for others)
     :param hindsight_share: in [0, 1], of the prior. By measurement, docs/trials.md: without, no task is found that lies
         elsewhere than those of training
     :raises ValueError: for a setting out of its range

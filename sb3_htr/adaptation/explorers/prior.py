@@ -18,7 +18,8 @@ class FixedExploration(Explorer):
     """
     Explores for a number of episodes that is fixed beforehand, whatever they find.
 
-    :param n_exploration_episodes: 0 or more episodes before the posterior is used (PEARL's reference, num_exp_traj_eval: 5)
+    :param n_exploration_episodes: 0 or more episodes before the posterior is used (PEARL's reference, num_exp_traj_eval: 5 for
+        the sparse point robot, 1 or 2 for others)
     :raises ValueError: if it is negative
     """
 
@@ -69,7 +70,8 @@ class Prior(FixedExploration):
     """
     z ~ N(0, I) for a fixed number of episodes, then from the posterior over all episodes.
 
-    :param n_exploration_episodes: 0 or more episodes before the posterior is used (PEARL's reference, num_exp_traj_eval: 5)
+    :param n_exploration_episodes: 0 or more episodes before the posterior is used (PEARL's reference, num_exp_traj_eval: 5 for
+        the sparse point robot, 1 or 2 for others)
     :raises ValueError: if it is negative
     """
 
