@@ -157,10 +157,10 @@ def under_prior(env_id: str = "default", end: str = "-prior") -> tuple[Variant, 
     """
     :param env_id: as for :func:`settings_of`
     :param end: of the methods' names: whether `prior` explores in rollouts, too
-    :return: HTR, and the dense proxy, with the settings that are made for PEARL's own protocol
+    :return: HTR, and PEARL with a dense and a sparse reward, with the settings that are made for PEARL's own protocol
     """
     settings = settings_of("pearl_prior.yml", env_id)
-    return tuple(Variant(method + end, settings=settings) for method in ("htr-ser", "pearl-dense"))
+    return tuple(Variant(method + end, settings=settings) for method in ("htr-ser", "pearl-dense", "pearl-sparse"))
 
 
 # PEARL's methods on robots; the budgets of the two others are those of their YAML files
@@ -198,7 +198,7 @@ ALL = (
     ),
     Experiment(
         "prior",
-        "PEARL's own protocol, in rollouts and at meta-test, with settings made for it: HTR, and the dense proxy reward.",
+        "PEARL's own protocol, in rollouts and at meta-test, with settings made for it: HTR, and no relabelling.",
         POINT,
         150_000,
         under_prior(),
@@ -206,7 +206,7 @@ ALL = (
     ),
     Experiment(
         "wheeled_prior",
-        "The same on a robot with wheels: HTR, and the dense proxy reward.",
+        "The same on a robot with wheels.",
         WHEELED,
         300_000,
         under_prior(WHEELED),
@@ -215,7 +215,7 @@ ALL = (
     ),
     Experiment(
         "ant_prior",
-        "PEARL's own protocol at meta-test, on an ant: HTR, and the dense proxy reward, with settings made for it.",
+        "PEARL's own protocol at meta-test, on an ant, with settings made for it: HTR, and no relabelling.",
         ANT,
         300_000,
         under_prior(ANT, end=""),
