@@ -451,7 +451,9 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         columns = self.transitions
         chosen = self._rng.permutation(len(rows))[:n_labelled]
         traj = columns.trajectory(rows[chosen])
-        reward = task_reward(self.task_family.compute_reward(traj, tasks), traj.task_free_reward)
+        told = self.task_family.compute_reward(traj, tasks)
+        check_returned_rewards(told, (len(tasks), len(chosen)), " under all tasks of a meta-batch")
+        reward = task_reward(told, traj.task_free_reward)
         rewarded = task_reward(context[:, columns.reward], context[:, columns.task_free_reward]) > 0
         inferred = np.logical_or.reduceat(rewarded, first_rows(n_context))
         return RewardLabels(
@@ -488,5 +490,5 @@ class MultiTaskReplayBuffer(ReplayBuffer):
         """
         traj = self.transitions.trajectory(rows.take(where, axis=0)[:, None])
         reward = self.task_family.compute_reward(traj, tasks, reward_type=reward_type)
-        check_returned_rewards(reward, traj, f" with reward_type={reward_type!r}, for a hindsight task,")
+        check_returned_rewards(reward, (len(where), 1), f" with reward_type={reward_type!r}, for a hindsight task,")
         rows[where, self.transitions.reward] = reward[:, 0]

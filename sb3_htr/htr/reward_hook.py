@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -36,7 +35,7 @@ def check_reward_hook(
     tasks = family.train_tasks[task]
     traj = columns.trajectory(rows[:, None])
     rewards = np.asarray(family.compute_reward(traj, tasks))
-    check_returned_rewards(rewards, traj)
+    check_returned_rewards(rewards, (len(rows), 1))
     given, computed = rows[:, columns.reward], rewards[:, 0]
     successes = np.asarray(family.is_success(traj, tasks))
     if successes.dtype != np.bool_:
@@ -65,14 +64,14 @@ def check_reward_hook(
         )
 
 
-def check_returned_rewards(rewards: np.ndarray, traj: Any, when: str = "") -> None:
+def check_returned_rewards(rewards: np.ndarray, expected: tuple[int, ...], when: str = "") -> None:
     """
     :param rewards: what the reward hook returned
-    :param traj: steps, (n, 1, ...), that it was asked for
+    :param expected: shape that they should have
     :param when: further words for the message
-    :raises ValueError: if it is no finite number for each of them
+    :raises ValueError: if it is no finite number for each step
     """
-    if np.shape(rewards) != (expected := np.shape(traj.task_free_reward)):
+    if np.shape(rewards) != expected:
         raise ValueError(f"compute_reward{when} returned shape {np.shape(rewards)}, expected {expected}: one for each step.")
     if not np.isfinite(rewards).all():
         raise ValueError(f"compute_reward{when} returned NaN or infinity, expected finite rewards.")
@@ -156,7 +155,7 @@ def _check_worth(family: TaskFamily, columns: Transitions, last: np.ndarray) -> 
             "not happen. Run htr_envs.check_task_env(env) to find out more."
         )
     reward = family.compute_reward(traj, achieved)
-    check_returned_rewards(reward, traj, " for the task that hindsight_task named")
+    check_returned_rewards(reward, (len(last), 1), " for the task that hindsight_task named")
     worth = task_reward(reward, traj.task_free_reward)[:, 0]
     if (worth <= 0).any():
         i = int(worth.argmin())

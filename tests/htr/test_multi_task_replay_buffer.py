@@ -288,6 +288,27 @@ def test_a_reward_hook_that_returns_no_rewards_is_refused(spoil: Any, sentence: 
         buffer.sample(4)
 
 
+@pytest.mark.parametrize(
+    ("spoil", "sentence"),
+    [
+        (lambda rewards: rewards + np.nan, "NaN or infinity, expected finite rewards"),
+        (lambda rewards: rewards + np.inf, "NaN or infinity, expected finite rewards"),
+        (lambda rewards: rewards[:1], r"shape \(1, 10\), expected \(16, 10\): one for each step"),
+    ],
+)
+def test_the_reward_model_is_taught_no_rewards_that_are_none(spoil: Any, sentence: str) -> None:
+    """Where nothing is relabelled, it alone is told what other tasks pay."""
+    buffer = filled(relabel_probability=0.0)
+
+    class Broken(PointRobotFamily):
+        def compute_reward(self, traj: Any, task: Any, reward_type: str = "sparse") -> Any:
+            return spoil(super().compute_reward(traj, task, reward_type))
+
+    buffer.task_family = Broken()
+    with pytest.raises(ValueError, match=f"^compute_reward under all tasks of a meta-batch returned {sentence}"):
+        buffer.sample(4, n_labelled=10)
+
+
 class Apart(Relabeller):
     """Has a store of its own, of episodes that are marked, and wants half of the RL batch from the replay."""
 
