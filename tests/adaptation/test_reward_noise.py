@@ -83,9 +83,18 @@ def test_without_noise_the_threshold_is_that_of_training() -> None:
     np.testing.assert_array_equal(told(RewardWatch(3, THRESHOLD, WORTH), steps), steps > THRESHOLD)
 
 
-def test_noise_that_hides_successes_is_warned_of() -> None:
-    steps = np.random.default_rng(0).normal(size=(100, 2)) * [0.2, 0.7]
-    with pytest.warns(UserWarning, match=r"standard deviation of 0\.\d+, among which a success of up to 0\.9 can") as caught:
+@pytest.mark.parametrize("scale", [0.15, 0.25, 0.5, 2.0])
+def test_noise_is_told_also_where_the_threshold_is_small(scale: float) -> None:
+    """As where a success pays next to nothing at the rim of a goal, and much in its middle."""
+    rng, watch = np.random.default_rng(0), RewardWatch(10, 0.05, 10 * scale)
+    assert told(watch, rng.normal(scale=scale, size=(800, 10)))[200:].mean() < 0.01
+    assert told(watch, 6 * scale + rng.normal(scale=scale, size=(50, 10))).mean() > 0.9
+
+
+@pytest.mark.parametrize("scale", [0.7, 1.6])
+def test_noise_that_hides_successes_is_warned_of(scale: float) -> None:
+    steps = np.random.default_rng(0).normal(size=(100, 2)) * [0.2, scale]
+    with pytest.warns(UserWarning, match=r"standard deviation of \d\.\d+, among which a success of up to 0\.9 can") as caught:
         told(RewardWatch(2, THRESHOLD, WORTH), steps)
     assert len([warning for warning in caught if "deviation" in str(warning.message)]) == 1
     with warnings.catch_warnings():
