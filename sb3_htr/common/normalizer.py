@@ -1,4 +1,4 @@
-"""Observations on one scale, whatever their units."""
+"""Observations on one scale, in whatever units."""
 
 import numpy as np
 import torch as th
@@ -11,7 +11,9 @@ EPSILON, CLIP = 1e-8, 10.0
 
 class ObservationNormalizer(nn.Module):
     """
-    Subtracts the running mean of what was observed in training, and divides by the standard deviation.
+    Subtracts the running mean of what was observed in training, and divides by the standard deviation. What varies by less
+    than 1e-4 is divided by about that, so that the jitter of a constant stays small; but so do micrometres that are given in
+    metres.
 
     It is a part of the policy and saved with it. SB3's ``VecNormalize`` does the same outside of the policy, where a model
     that is loaded without it acts on other numbers than it was trained on, and where stored observations are changed.
