@@ -4,6 +4,7 @@ import argparse
 import subprocess
 import sys
 import warnings
+from itertools import combinations
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -13,6 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
@@ -144,6 +146,21 @@ def test_curves_that_coincide_are_all_seen(tmp_path: Path) -> None:
     for name, (colour, _) in zip(names, curve_styles(names), strict=True):
         n_seen = (np.abs(pixels - to_rgb(colour)).max(axis=-1) < 0.02).sum()
         assert n_seen >= 24, f"{name} is hidden"
+
+
+def test_markers_are_told_apart_without_their_colours() -> None:
+    ink = []
+    for colour in style.COLOURS:
+        figure = Figure(figsize=(0.25, 0.25), dpi=120)
+        canvas = FigureCanvasAgg(figure)
+        axes = figure.add_axes((0, 0, 1, 1))
+        axes.axis("off")
+        curves.band(axes, np.arange(3), np.zeros((1, 3)), colour, "-", "")
+        axes.lines[0].set(color="black", markevery=[1])
+        canvas.draw()
+        ink.append(1 - np.asarray(canvas.buffer_rgba())[..., 0] / 255)
+    for one, other in combinations(ink, 2):
+        assert np.minimum(one, other).sum() / np.maximum(one, other).sum() < 0.82, "as of a circle and a hexagon"
 
 
 def test_a_method_has_one_colour_in_all_pictures() -> None:

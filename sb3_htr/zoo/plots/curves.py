@@ -13,7 +13,7 @@ from sb3_htr.zoo.plots.style import COLOURS, curve_styles, save, span_unit_if_fl
 # On a curve of more points, on some of them
 N_MARKERS = 12
 # Hollow and each of another shape, so that of curves that coincide, as where nothing is solved, all are seen
-MARKERS = dict(zip(COLOURS, "oXD^vxsph*", strict=True))
+MARKERS = dict(zip(COLOURS, "oXD^vxs<>*", strict=True))
 
 
 def band(axes: Axes, x: np.ndarray, scores: np.ndarray, colour: str, style: str, label: str, alpha: float = 0.2) -> None:
