@@ -163,6 +163,18 @@ def test_markers_are_told_apart_without_their_colours() -> None:
         assert np.minimum(one, other).sum() / np.maximum(one, other).sum() < 0.82, "as of a circle and a hexagon"
 
 
+@pytest.mark.parametrize("n_curves", [1, 24])
+def test_a_legend_covers_no_label(n_curves: int, drawn: list[Figure]) -> None:
+    zeros = np.zeros((1, 3))
+    plots_of = {f"mine {i}": curves.Curve(np.arange(3), zeros, zeros, f"mine {i}") for i in range(n_curves)}
+    curves.plot_curves(plots_of, Path("x.png"), "env", "x", "return")
+    (figure,) = drawn
+    figure.draw_without_rendering()
+    for axes in figure.axes:
+        label, legend = axes.xaxis.label.get_window_extent(), axes.get_legend()
+        assert legend is not None and 0 < label.y0 - legend.get_window_extent().y1 < figure.dpi / 4
+
+
 def test_a_method_has_one_colour_in_all_pictures() -> None:
     every = dict(zip(methods(), curve_styles(list(methods())), strict=True))
     assert len(set(every.values())) == len(every), "no two methods look alike"

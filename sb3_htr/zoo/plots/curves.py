@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.transforms import offset_copy
 
 from sb3_htr.zoo.plots.intervals import iqm_interval
 from sb3_htr.zoo.plots.style import COLOURS, curve_styles, save, span_unit_if_flat
@@ -45,7 +46,9 @@ def finish(figure: Figure, path: Path, title: str, legend_columns: int = 2) -> N
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.25)
         if axes.get_legend_handles_labels()[0]:
-            below: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.17)}
+            # As far below as the axis needs for its ticks and its label, however high the axes are
+            place = offset_copy(axes.transAxes, figure, y=-0.42, units="inches")
+            below: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, 0), "bbox_transform": place}
             # Handles so long that dashes are seen beside the marker
             axes.legend(ncols=legend_columns, frameon=False, fontsize=8, handlelength=4, **below)
     figure.suptitle(title, fontsize=11)
