@@ -14,9 +14,9 @@ from sb3_htr.experiments.calibration import expected_calibration_error
 from sb3_htr.experiments.cell import Cell
 from sb3_htr.experiments.protocol import SOLVED_SHARE, scores
 from sb3_htr.experiments.runner import in_training
-from sb3_htr.zoo.plots.curves import band, finish
+from sb3_htr.zoo.plots.curves import band, finish, marked_line
 from sb3_htr.zoo.plots.intervals import iqm_interval
-from sb3_htr.zoo.plots.style import BLUE, GREY, curve_colours, save
+from sb3_htr.zoo.plots.style import BLUE, GREY, curve_colours, curve_styles, save
 
 Results = dict[Cell, Path]
 # Draws the results of an experiment into a file
@@ -271,15 +271,17 @@ def reliability(results: Results, path: Path) -> None:
     groups = {variant: np.sum([raw["calibration"] for _, raw in runs], axis=0) for variant, runs in variants}
     if not any(bins.any() for bins in groups.values()):
         return
-    figure = matplotlib.figure.Figure(figsize=(4.8, 4.4), layout="constrained")
+    # Higher by each line of the legend, and wide enough for the longest
+    figure = matplotlib.figure.Figure(figsize=(5.4, 3.6 + len(groups) / 6), layout="constrained")
     axes = figure.subplots()
     axes.plot([0, 1], [0, 1], color=GREY, linewidth=1)
-    for colour, (variant, bins) in zip(curve_colours([*groups]), groups.items(), strict=True):
+    for (colour, line), (variant, bins) in zip(curve_styles([*groups]), groups.items(), strict=True):
         if not bins.any():
             continue
         n, probability, successes = bins[bins[:, 0] > 0].T
-        text = f"{variant}: expected calibration error {expected_calibration_error(bins):.3f}"
-        axes.plot(probability / n, successes / n, "o-", color=colour, markersize=4, label=text)
+        text = f"{variant}: {expected_calibration_error(bins):.3f}"
+        marked_line(axes, probability / n, successes / n, colour, line, text)
+    axes.set_title("behind each name: expected calibration error", fontsize=9)
     axes.set_xlabel("probability of success by the reward model")
     axes.set_ylabel("frequency of success")
     finish(figure, path, f"{next(iter(results)).env_id}: states and validation tasks of {n_seeds(results)} seeds", 1)

@@ -29,6 +29,15 @@ def test_without_successes_no_picture_says_how_well_they_are_predicted(tmp_path:
     assert not (tmp_path / "reliability.png").exists()
 
 
+def test_what_reward_models_say_is_told_apart_without_colours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = list[Figure]()
+    monkeypatch.setattr(figures, "finish", lambda figure, *_: drawn.append(figure))
+    figures.reliability(made_up(EXPERIMENTS["goal_distance"].cells(1), tmp_path), tmp_path / "reliability.png")
+    _, *lines = drawn[0].axes[0].lines  # the first is what a perfect model would say
+    looks = [(line.get_marker(), line.get_linestyle()) for line in lines]
+    assert len(looks) == len(set(looks)) > 10
+
+
 @pytest.mark.parametrize("name", ["point_robot", "wheeled", "ablation", "goal_distance", "relabelling", "rivals"])
 @pytest.mark.parametrize("chosen", [slice(-1, None), slice(1, None, 2)], ids=["the last run", "every other run"])
 def test_what_is_finished_of_an_experiment_is_reported_alone(

@@ -17,6 +17,21 @@ N_MARKERS = 12
 MARKERS = dict(zip(COLOURS, "oXD^vxs<>*", strict=True))
 
 
+def marked_line(axes: Axes, x: np.ndarray, y: np.ndarray, colour: str, style: str, label: str) -> None:
+    """
+    Draw a line with the marker of its colour.
+
+    :param axes: where
+    :param x: (n,)
+    :param y: (n,)
+    :param colour: one of :data:`~sb3_htr.zoo.plots.style.COLOURS`
+    :param style: of the line, matplotlib's
+    :param label: for the legend
+    """
+    (line,) = axes.plot(x, y, style, color=colour, label=label, markersize=5, markerfacecolor="none")
+    line.set(marker=MARKERS[colour], markevery=-(-len(x) // N_MARKERS))
+
+
 def band(axes: Axes, x: np.ndarray, scores: np.ndarray, colour: str, style: str, label: str, alpha: float = 0.2) -> None:
     """
     Draw the IQM over runs at each x, with its interval.
@@ -30,8 +45,7 @@ def band(axes: Axes, x: np.ndarray, scores: np.ndarray, colour: str, style: str,
     :param alpha: of the interval: less where many lie above each other
     """
     points = np.array([iqm_interval(scores[..., i]) for i in range(len(x))])
-    (line,) = axes.plot(x, points[:, 0], style, color=colour, label=label, markersize=5, markerfacecolor="none")
-    line.set(marker=MARKERS[colour], markevery=-(-len(x) // N_MARKERS))
+    marked_line(axes, x, points[:, 0], colour, style, label)
     axes.fill_between(x, points[:, 1], points[:, 2], color=colour, alpha=alpha, linewidth=0)
 
 
