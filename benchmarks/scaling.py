@@ -19,7 +19,7 @@ from sb3_htr import PEARL
 from sb3_htr.adaptation.evaluation import evaluate_adaptation
 from sb3_htr.common.vec_env import make_task_vec_env
 from sb3_htr.pearl.pearl import N_LABELLED
-from sb3_htr.zoo.plots.curves import finish
+from sb3_htr.zoo.plots.curves import finish, marked_line
 from sb3_htr.zoo.plots.style import COLOURS
 
 ENV_ID = "Scaling-v0"
@@ -256,8 +256,8 @@ def plot(panels: list[tuple[str, list[int], Curves]]) -> None:
     for axes, (name, sizes, curves) in zip(all_axes.flat, panels, strict=True):
         for what, (unit, values) in curves.items():
             durations = np.array(values) / PER_MS[unit]
-            axes.loglog(sizes, durations, "o-", color=colours[what], label=what, markersize=4)
-        axes.set_xlabel(name)
+            marked_line(axes, np.array(sizes), durations, colours[what], "-", what)
+        axes.set(xscale="log", yscale="log", xlabel=name)
     for axes in all_axes[:, 0]:
         axes.set_ylabel("ms")
     finish(figure, PICTURE, "Duration as work grows, one thread; both axes are logarithmic", legend_columns=1)
