@@ -148,6 +148,35 @@ def test_curves_that_coincide_are_all_seen(tmp_path: Path) -> None:
         assert n_seen >= 24, f"{name} is hidden"
 
 
+# Of linear RGB, as it is seen without one kind of cones: Machado, Oliveira and Fernandes, 2009, severity 1
+VISION = {
+    "all": np.eye(3).tolist(),
+    "no red": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    "no green": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+    "no blue": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+}
+# From linear RGB to Oklab, in which distances are as they are seen: Ottosson, 2020
+TO_CONES = [[0.412221, 0.536333, 0.051446], [0.211903, 0.680700, 0.107397], [0.088302, 0.281719, 0.629979]]
+TO_OKLAB = [[0.210454, 0.793618, -0.004072], [1.977998, -2.428592, 0.450594], [0.025904, 0.782772, -0.808676]]
+
+
+@pytest.mark.parametrize("vision", VISION)
+def test_colours_are_told_apart_by_all_kinds_of_vision(vision: str) -> None:
+    rgb = np.array([to_rgb(colour) for colour in style.COLOURS])
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    seen = np.clip(linear @ np.transpose(VISION[vision]), 0, 1)
+    points = np.cbrt(seen @ np.transpose(TO_CONES)) @ np.transpose(TO_OKLAB)
+    distances = {(one, other): np.linalg.norm(points[one] - points[other]) for one, other in combinations(range(len(rgb)), 2)}
+    closest = min(distances, key=lambda pair: distances[pair])
+    assert distances[closest] > 0.07, f"{[style.COLOURS[i] for i in closest]}, and 0.02 is all that is seen"
+
+
+def test_thin_grey_lines_are_seen_on_white() -> None:
+    """A contrast of 3 and more, as WCAG 2.1 asks of what a picture is understood by (1.4.11)."""
+    grey = to_rgb(style.GREY)[0]
+    assert 1.05 / (((grey + 0.055) / 1.055) ** 2.4 + 0.05) >= 3
+
+
 def test_markers_are_told_apart_without_their_colours() -> None:
     ink = []
     for colour in style.COLOURS:

@@ -11,8 +11,8 @@ from sb3_htr.common.atomic import atomic_path
 from sb3_htr.zoo.run.method import PRIOR, methods
 
 # Okabe and Ito's colours, told apart by all kinds of colour vision, and three dark ones; grey is the last to be taken, as its
-# bands are those of black
-COLOURS = ["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#882255", "#000000", "#332288", "#999999"]
+# bands are those of black, and so dark that it is not their pink to those who see no green
+COLOURS = ["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#882255", "#000000", "#332288", "#707070"]
 BLUE, ORANGE, GREEN, GREY = *COLOURS[:3], COLOURS[-1]
 LINES = ("-", "--", ":")
 
