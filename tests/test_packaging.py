@@ -1,6 +1,7 @@
 """What is in the sdist and in the wheel that is built from it, tried from an empty folder."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from configparser import ConfigParser
 from pathlib import Path
 
 import pytest
+import yaml
 
 from helpers.runs import SMALL
 
@@ -35,6 +37,16 @@ def test_one_version_is_told_everywhere() -> None:
     version = (ROOT / "sb3_htr" / "version.txt").read_text().strip()
     assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
     assert (ROOT / "CHANGELOG.md").read_text().startswith(f"# Changelog\n\n## Release {version} ")
+
+
+def test_what_is_cited_is_the_same_everywhere() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    titles = {reference["title"] for reference in citation["references"]}
+    of_manual = re.findall(r"^  title +=(.*),$", (ROOT / "docs" / "index.md").read_text(), flags=re.MULTILINE)
+    assert len(of_manual) == 2 and {re.sub("[{}]", "", title).strip() for title in of_manual} <= titles
+    rivals = set(re.findall(r"https://arxiv.org/abs/[\d.]+", (ROOT / "docs" / "rivals.md").read_text()))
+    # SAC and HER are those of Stable-Baselines3
+    assert rivals - {reference["url"] for reference in citation["references"]} == {"https://arxiv.org/abs/1707.01495"}
 
 
 @pytest.fixture(scope="module")
