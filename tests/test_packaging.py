@@ -67,7 +67,9 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (wheel,) = dist.glob("*.whl")
     with zipfile.ZipFile(wheel) as unpacked:
         unpacked.extractall(site)
-    assert {path.name for path in site.iterdir() if path.suffix != ".dist-info"} == {"sb3_htr", "htr_envs"}
+    (about,) = site.glob("*.dist-info")
+    assert {path.name for path in site.iterdir()} == {"sb3_htr", "htr_envs", about.name}
+    assert "\nLicense-Expression: MIT\n" in (about / "METADATA").read_text() and (about / "licenses" / "LICENSE").exists()
     return site
 
 
