@@ -30,10 +30,10 @@ SHORT: dict[str, tuple[str, str | None]] = {
 }
 SHORT_COLUMNS = (
     ("HTR", "htr-ser", False),
-    ("further away", "htr-ser", True),
+    ("HTR, further away", "htr-ser", True),
     ("PEARL without relabelling", "pearl-sparse", False),
     ("PEARL, dense reward in training", "pearl-dense", False),
-    ("further away", "pearl-dense", True),
+    ("dense reward, further away", "pearl-dense", True),
 )
 # That of the results, and of PEARL's own protocol: methods by their experiments; explorers with what is shown of them
 HEADLINES: dict[str, dict[str, tuple[str, ...]]] = {
@@ -47,7 +47,7 @@ HEADLINES: dict[str, dict[str, tuple[str, ...]]] = {
         "point_maze": ("htr-ser",),
     },
     "headline:prior": {
-        "prior": ("htr-ser-prior", "pearl-dense-prior"),
+        "prior": ("htr-ser-prior", "pearl-dense-prior", "pearl-sparse-prior"),
         "wheeled_prior": ("htr-ser-prior", "pearl-dense-prior"),
         "ant_prior": ("htr-ser", "pearl-dense"),
     },
@@ -61,7 +61,7 @@ COMPARED: dict[str, dict[str, tuple[str, ...]]] = {
         "target_speed": ("pearl-sparse", "pearl-dense"),
         "fetch_reach": ("pearl-sparse",),
         "fetch_push": ("pearl-sparse",),
-        "prior": ("pearl-dense-prior",),
+        "prior": ("pearl-sparse-prior", "pearl-dense-prior"),
         "wheeled_prior": ("pearl-dense-prior",),
     },
     "differences:rivals": {
@@ -95,7 +95,7 @@ def short(summaries: dict[str, dict[str, Any]]) -> str:
         n_runs = min(row["n_seeds"] for row in shown if row)
         few = f"; {n_runs} runs" if n_runs < MIN_RUNS else ""
         lines.append([env + few, *(_interval(row) if row else "" for row in shown)])
-    return markdown_table(["", *(head for head, *_ in SHORT_COLUMNS)], lines) + "\n"
+    return markdown_table(["env", *(head for head, *_ in SHORT_COLUMNS)], lines) + "\n"
 
 
 def headline(summaries: dict[str, dict[str, Any]], methods_of: dict[str, tuple[str, ...]], results: Path = RESULTS) -> str:
