@@ -221,10 +221,10 @@ class MetaEnv(HasTaskFamily, gym.Env[FloatArray, FloatArray], ABC):
 
     def __init__(self, task_family: TaskDistribution) -> None:
         self.task_family = task_family
-        self._given: tuple[int, FloatArray] | None = None
-        self._current: tuple[int, FloatArray] | None = None
+        self._given_task: tuple[int, FloatArray] | None = None
+        self._task_of_episode: tuple[int, FloatArray] | None = None
         # The latest one, in float32, in which it is stored and learnt from, whatever the space has
-        self._observation: FloatArray | None = None
+        self._last_observation: FloatArray | None = None
 
     @abstractmethod
     def _reset_state(self) -> FloatArray:
@@ -248,19 +248,19 @@ class MetaEnv(HasTaskFamily, gym.Env[FloatArray, FloatArray], ABC):
         :raises ValueError: if the id is out of range or the vector is not in the task space.
         """
         if task is None:
-            self._given = None
+            self._given_task = None
         elif np.ndim(task) == 0:
-            self._give("task_id", task)
+            self._give_task("task_id", task)
         else:
-            self._give("task", task)
+            self._give_task("task", task)
 
-    def _give(self, key: str, value: Any) -> None:
+    def _give_task(self, key: str, value: Any) -> None:
         if key == "task_id":
             task_id = int(self.task_family.task_indices(value, ()))
-            self._given = (task_id, self.train_tasks[task_id])
+            self._given_task = (task_id, self.train_tasks[task_id])
         else:
             assert self.task_space.shape is not None
-            self._given = (-1, self.task_family.task_vectors(value, self.task_space.shape))
+            self._given_task = (-1, self.task_family.task_vectors(value, self.task_space.shape))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[FloatArray, dict[str, Any]]:
         """Start an episode.
@@ -273,11 +273,11 @@ class MetaEnv(HasTaskFamily, gym.Env[FloatArray, FloatArray], ABC):
         chosen = task_from_options(options)
         check_seed(seed)
         if chosen is not None:
-            self._give(*chosen)
+            self._give_task(*chosen)
         super().reset(seed=seed)  # not before: a reset that is refused changes nothing
         # drawn even if it is not used: a seed then gives the same starts whichever way the task was chosen
         drawn = int(self.np_random.integers(len(self.train_tasks)))
-        self._current = (drawn, self.train_tasks[drawn]) if self._given is None else self._given
+        self._task_of_episode = (drawn, self.train_tasks[drawn]) if self._given_task is None else self._given_task
         return self._remember_observation(self._reset_state()), {"task_id": self.task_id}
 
     def _remember_observation(self, state: ArrayLike) -> FloatArray:
@@ -288,7 +288,7 @@ class MetaEnv(HasTaskFamily, gym.Env[FloatArray, FloatArray], ABC):
                 f"terminates. Expected an observation of shape {self.observation_space.shape}, got {given}."
             )
         observation: FloatArray = np.array(state, dtype=self.observation_space.dtype)
-        self._observation = observation.astype(np.float32)
+        self._last_observation = observation.astype(np.float32)
         return observation
 
     def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
@@ -315,7 +315,7 @@ class MetaEnv(HasTaskFamily, gym.Env[FloatArray, FloatArray], ABC):
         :param action: what the agent gave.
         :return: the action as float32, next observation, reward and termination of ``_step_state``.
         """
-        if self._observation is None:
+        if self._last_observation is None:
             raise ResetNeeded("step was called before the first reset: call env.reset() first.")
         action = checked_action(action, self.action_space)
         stepped = self._step_state(action)
@@ -335,9 +335,9 @@ class MetaEnv(HasTaskFamily, gym.Env[FloatArray, FloatArray], ABC):
         return action, self._remember_observation(state), reward, terminated
 
     def _current_task(self) -> tuple[int, FloatArray]:
-        if self._current is None:
+        if self._task_of_episode is None:
             raise ResetNeeded("The env has no task before its first reset: call env.reset() first.")
-        return self._current
+        return self._task_of_episode
 
     @property
     def task(self) -> FloatArray:

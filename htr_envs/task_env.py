@@ -206,9 +206,9 @@ class TaskEnv(HasRewardHooks, MetaEnv):
         :raises ValueError: if the action has the wrong shape, or is not finite; or for what ``_step_state`` may not return.
         :raises gymnasium.error.ResetNeeded: before the first reset.
         """
-        before = self._observation
+        before = self._last_observation
         action, observation, task_free_reward, terminated = self._checked_step(action)
-        after = self._observation
+        after = self._last_observation
         assert before is not None and after is not None
         # one reward function for step and for relabelling: compute_reward gives step's rewards again, bit for bit
         traj = Trajectory(before[None], action[None], after[None], np.array([task_free_reward], np.float32))

@@ -60,6 +60,50 @@ def test_it_trains_adapts_and_goes_on(tiny_pearl: MakePEARL, tmp_path: Path, rec
         th.testing.assert_close(parameters(resumed)[name], value, rtol=0, atol=0, msg=name)
 
 
+def test_rewards_that_no_family_tells_may_be_any(tiny_pearl: MakePEARL) -> None:
+    """What stands between them and the replay is a part of the env, but for what is not saved with the model."""
+    env = make_cart()
+    env.unwrapped.reward_type = "dense"  # type: ignore[attr-defined]
+    scaled = gym.wrappers.TransformReward(env, lambda reward: 100 * float(reward))
+    model = tiny_pearl(scaled, **PLAIN).learn(100)
+    assert model.replay_buffer is not None
+    rows = model.replay_buffer.episodes.take(np.arange(model.replay_buffer.size()))
+    columns = model.replay_buffer.transitions
+    np.testing.assert_allclose(rows[:, columns.reward], 100 * rows[:, columns.next_observation][:, 0], rtol=1e-5)
+    with pytest.raises(ValueError, match="NormalizeReward stands between the env and relabelled rewards"):
+        tiny_pearl(gym.wrappers.NormalizeReward(make_cart()), **PLAIN)
+
+
+class Wired(CartEnv):
+    """Has attributes of usual names, which the base class must not have taken."""
+
+    def _observation(self) -> Any:
+        return [self.x]
+
+    def _current(self) -> float:
+        return 2.0
+
+    def _given(self, action: Any) -> float:
+        return float(action[0])
+
+    def _reset_state(self) -> Any:
+        super()._reset_state()
+        return self._observation()
+
+    def _step_state(self, action: Any) -> Any:
+        self.x += self._current() * self._given(action)
+        return self._observation(), self.x, False
+
+
+def test_methods_of_ones_own_meet_none_of_the_base_class() -> None:
+    env = TimeLimit(Wired(), 10)
+    obs, _ = env.reset(seed=0)
+    for _ in range(3):
+        after = env.step(np.array([0.5], dtype=np.float32))[0]
+        np.testing.assert_allclose(after, obs + 1.0)
+        obs = after
+
+
 def test_the_posterior_is_that_of_the_rewards(tiny_pearl: MakePEARL) -> None:
     """The explorer of rollouts draws from it, though no reward is a success."""
     model = tiny_pearl(make_cart(), **PLAIN).learn(100)

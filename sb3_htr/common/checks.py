@@ -270,9 +270,11 @@ def _time_limits(env: gym.Env[Any, Any]) -> Iterator[int]:
 def check_rewards(env: VecEnv) -> None:
     """
     :param env: env to train on
-    :raises ValueError: if something stands between its rewards and the replay buffer, or they are the dense proxy
+    :raises ValueError: if it is normalized, or returns other rewards than its task family tells
     """
     check_is_not_normalized(env)
+    if not tells_rewards(get_task_family(env)):
+        return
     if any(env.env_is_wrapped(gym.RewardWrapper)):
         raise ValueError(
             "The env is in gymnasium's RewardWrapper, which changes its rewards, but relabelled rewards are those of its task "

@@ -431,8 +431,8 @@ class DisturbedByHooks(LineEnv):
 
 @breaks("reset does not honour options={'task': vector}")
 class IgnoresVectors(LineEnv):
-    def _give(self, key: str, value: Any) -> None:
-        super()._give(key, self.test_tasks[0] if key == "task" and np.isfinite(value).all() else value)
+    def _give_task(self, key: str, value: Any) -> None:
+        super()._give_task(key, self.test_tasks[0] if key == "task" and np.isfinite(value).all() else value)
 
 
 @breaks("reset does not honour options={'task': vector}: the task_id is 0, it must be -1")
@@ -457,16 +457,16 @@ class UnboundedActions(LineEnv):
 
 @breaks("reset does not honour options={'task_id': i}")
 class IgnoresIds(LineEnv):
-    def _give(self, key: str, value: Any) -> None:
-        super()._give(key, 0 if key == "task_id" else value)
+    def _give_task(self, key: str, value: Any) -> None:
+        super()._give_task(key, 0 if key == "task_id" else value)
 
 
 @breaks("A task given in the options of a reset does not stay")
 class ForgetsOptions(LineEnv):
     def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        given = self._given
+        given = self._given_task
         result = super().reset(seed=seed, options=options)
-        self._given = given
+        self._given_task = given
         return result
 
 
@@ -480,7 +480,7 @@ class DrawsOnce(LineEnv):
 class SetsTaskAtOnce(LineEnv):
     def set_task(self, task: Any) -> None:
         super().set_task(task)
-        self._current = self._given or self._current
+        self._task_of_episode = self._given_task or self._task_of_episode
 
 
 @breaks("A task id given to set_task does not stay")
