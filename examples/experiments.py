@@ -8,9 +8,10 @@
     sb3-htr experiment four_corners --gym-packages examples.experiments
     sb3-htr experiment half_cheetah_velocity --gym-packages examples.experiments
     sb3-htr experiment dense_context --gym-packages examples.experiments
+    sb3-htr experiment turned_controls --gym-packages examples.experiments
 
-All settings are the defaults, those of SparseAnt-v0 on both ants, but for half_cheetah_velocity and dense_context, whose
-rewards are dense and which have PEARL's own protocol, and for the variants of ant_goal that say so.
+All settings are the defaults, those of SparseAnt-v0 on both ants, but for the last three, in which nothing is relabelled and
+which have PEARL's own protocol, and for the variants of ant_goal that say so.
 """
 
 from examples import (  # noqa: F401 register the envs
@@ -20,6 +21,7 @@ from examples import (  # noqa: F401 register the envs
     half_cheetah_velocity,
     hidden_target_reacher,
     sparse_half_cheetah_velocity,
+    turned_controls,
     two_link_arm,
 )
 from sb3_htr.experiments.grid import BELIEF, EXPERIMENTS, Experiment, Variant, by
@@ -108,4 +110,25 @@ EXPERIMENTS["dense_context"] = Experiment(
     ),
     eval_freq=50_000,
     evaluations=by(("prior",)),
+)
+
+# Tasks that change the dynamics: what it is worth that contexts tell where a step led, and for which rewards
+EXPERIMENTS["turned_controls"] = Experiment(
+    "turned_controls",
+    "Plain PEARL where tasks change the dynamics, with and without the next observation in contexts.",
+    "TurnedControls-v0",
+    100_000,
+    tuple(
+        Variant(
+            "pearl-sparse-prior",
+            f"{reward_type} rewards, {'o, a, r, next o' if use_next_obs else 'o, a, r'}",
+            {"explorer": FIRST, "train_explorer": FIRST, "policy_kwargs": {"use_next_obs_in_context": use_next_obs}},
+            {"reward_type": reward_type},
+        )
+        for reward_type in ("sparse", "dense")
+        for use_next_obs in (True, False)
+    ),
+    eval_freq=10_000,
+    evaluations=by(("prior",)),
+    n_episodes=3,
 )

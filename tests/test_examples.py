@@ -93,7 +93,7 @@ DENSE = {
     "ant_direction": "AntDirection-v0",
     "dense_point_robot": "DensePointRobot-v0",
 }
-DEPENDENT = {**DENSE, "walker_random_params": "WalkerRandomParams-v0"}
+DEPENDENT = {**DENSE, "walker_random_params": "WalkerRandomParams-v0", "turned_controls": "TurnedControls-v0"}
 OF_GYMNASIUM = (
     "hidden_target_reacher",
     "sparse_half_cheetah_velocity",
@@ -168,7 +168,7 @@ def test_the_experiments_are_of_registered_envs(monkeypatch: pytest.MonkeyPatch)
     known: dict[str, Any] = {}
     monkeypatch.setattr("sb3_htr.experiments.grid.EXPERIMENTS", known)
     runpy.run_module("examples.experiments")
-    assert set(known) == {*FAMILIES, "ant_goal", "half_cheetah_velocity", "dense_context"}
+    assert set(known) == {*FAMILIES, "ant_goal", "half_cheetah_velocity", "dense_context", "turned_controls"}
     for experiment in known.values():
         cells = experiment.cells()
         assert len(cells) == 5 * len(experiment.variants) and cells[0].env_id in gym.registry

@@ -134,7 +134,7 @@ class Adaptation:
         self.best_return = np.zeros(n_envs, dtype=np.float64)
         #: (n_envs,) what the most rewarded step returned beside what it would without success, taken for one or not
         self.largest_reward = np.zeros(n_envs, dtype=np.float64)
-        # Of the running episodes: observations, actions, rewards
+        # Of the running episodes, as a context has them; beside it, rewards of the task
         self._running: list[np.ndarray] = []
         self._n_steps = np.zeros(n_envs, dtype=np.int64)
         self._state = policy.encoder.empty(n_envs)
@@ -186,7 +186,7 @@ class Adaptation:
         if not self.is_training:  # what is collected is checked where it is stored
             check_step(step, self.n_envs, self.policy.obs_dim, self.policy.action_dim)
         self.task_reward = self._told(step) if self.is_training else self._learned(step)
-        self._remember(step.observations, step.actions, step.rewards, self.task_reward)
+        self._remember(step.observations, step.actions, step.rewards, step.next_observations, self.task_reward)
         self.episode_return += self.task_reward
         ended = np.flatnonzero(step.dones)
         self.n_episodes[ended] += 1

@@ -54,12 +54,14 @@ class Context(NamedTuple):
     :param observations: (n, obs_dim)
     :param actions: (n, action_dim), scaled to [-1, 1]
     :param rewards: (n,)
+    :param next_observations: (n, obs_dim), the last one of its episode where one ended
     :param lengths: (M,) int64, how many of these transitions are of each task
     """
 
     observations: th.Tensor
     actions: th.Tensor
     rewards: th.Tensor
+    next_observations: th.Tensor
     lengths: th.Tensor
 
 

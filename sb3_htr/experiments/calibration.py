@@ -50,9 +50,9 @@ def calibration(model: Model, env_id: str, env_kwargs: KwArgs, n_episodes: int) 
         best = max(episodes, key=lambda episode: gains[task, episode].sum())
         if success[task, task, best].any():
             taken, lengths = evenly_spread(np.array([len(best)]), model.context_size, gains[task, best])
-            o, a, r = (th.as_tensor(x[task, best[taken]], dtype=th.float32) for x in (obs, actions, rewards))
+            o, a, r, next_o = (th.as_tensor(x[task, best[taken]], dtype=th.float32) for x in (obs, actions, rewards, next_obs))
             with th.no_grad():
-                means.append(policy.infer(Context(o, a, r, th.as_tensor(lengths)))[0])
+                means.append(policy.infer(Context(o, a, r, next_o, th.as_tensor(lengths)))[0])
             solved.append(task)
     if not solved:
         return np.zeros((N_BINS, 3))

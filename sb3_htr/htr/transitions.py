@@ -45,5 +45,6 @@ class Transitions:
         :param device: where the context is put
         :return: what a posterior is inferred from
         """
-        arrays = rows[:, self.observation], rows[:, self.action], rows[:, self.reward], lengths
+        columns = self.observation, self.action, self.reward, self.next_observation
+        arrays = (*(rows[:, column] for column in columns), lengths)
         return Context(*(th.as_tensor(array, device=device) for array in arrays))

@@ -28,7 +28,7 @@ def kl_to_prior(mean: th.Tensor, variance: th.Tensor) -> th.Tensor:
 
 class ContextEncoder(nn.Module):
     """
-    Maps a set of transitions (o, a, r) to a Gaussian posterior over the task variable z, whatever their order.
+    Maps a set of transitions (o, a, r), or (o, a, r, o'), to a Gaussian posterior over the task variable z, in any order.
 
     The posterior is a product of Gaussians, one factor for each transition. What was taken in of a task is the sum of the
     factors' precisions and that of their precisions times means, (n_tasks, 2 * latent_dim).
@@ -37,7 +37,7 @@ class ContextEncoder(nn.Module):
     constructor: ``policy_kwargs={"encoder_class": MyEncoder}``. For ``cuda_graph``, it waits for no value that it computes,
     such as the longest of the lengths, and is finite for rows of zeros.
 
-    :param context_dim: length of a context row, obs_dim + action_dim + 1
+    :param context_dim: length of a context row, obs_dim + action_dim + 1, and obs_dim more where o' is in it
     :param latent_dim: dimension of z
     :param net_arch: hidden units per layer
     :param activation_fn: activation between layers

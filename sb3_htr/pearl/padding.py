@@ -21,6 +21,7 @@ def padded(data: MultiTaskSamples, n_context: int, n_rows: int, n_labelled: int)
             observations=_filled(data.context.observations, n_context),
             actions=_filled(data.context.actions, n_context),
             rewards=_filled(data.context.rewards, n_context),
+            next_observations=_filled(data.context.next_observations, n_context),
             lengths=_closed(data.context.lengths, n_context),
         ),
         observations=_filled(data.observations, n_rows),

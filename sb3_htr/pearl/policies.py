@@ -86,6 +86,8 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
         ``[200, 200, 200]``)
     :param encoder_class: what infers z, see :class:`ContextEncoder`; or the name of one of :mod:`sb3_htr.pearl.encoder`
     :param latent_dim: dimension of z (paper A.2: 5)
+    :param use_next_obs_in_context: a row of the context is (o, a, r, o'), for tasks that differ in their dynamics (as in
+        PEARL's reference, which has it for such families alone)
     :param normalize_observations: all networks see observations less their running mean in training, divided by the standard
         deviation. By measurement (one seed each), the Wheeled robot learns in half the steps with it, and the Point Robot as
         well as without it
@@ -105,6 +107,7 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
         encoder_arch: list[int] | None = None,
         encoder_class: type[ContextEncoder] | str = ContextEncoder,
         latent_dim: int = 5,
+        use_next_obs_in_context: bool = False,
         normalize_observations: bool = True,
         activation_fn: type[nn.Module] = nn.ReLU,
         n_critics: int = 2,
@@ -112,7 +115,7 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
         optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
         check_numbers(latent_dim=(latent_dim, 1), n_critics=(n_critics, 1))
-        check_flags(normalize_observations=normalize_observations)
+        check_flags(normalize_observations=normalize_observations, use_next_obs_in_context=use_next_obs_in_context)
         check_mappings(optimizer_kwargs=optimizer_kwargs)
         encoder_arch = [128, 128] if encoder_arch is None else encoder_arch
         check_layers(encoder_arch=encoder_arch)
@@ -123,6 +126,7 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
         self.latent_dim = latent_dim
         self.encoder_arch = encoder_arch
         self.encoder_class = to_encoder_class(encoder_class)
+        self.use_next_obs_in_context = use_next_obs_in_context
         self.normalize_observations = normalize_observations
         obs_dim, action_dim = (int(np.prod(space.shape)) for space in (observation_space, action_space))
         self.obs_dim, self.action_dim = obs_dim, action_dim
@@ -149,7 +153,7 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
         self._check_actor()
         self._actor_is_plain = type(self.actor) is Actor and type(self.actor.features_extractor) is FlattenExtractor
         self.normalizer = ObservationNormalizer(self.obs_dim) if self.normalize_observations else None
-        context_dim = self.obs_dim + self.action_dim + 1
+        context_dim = self.obs_dim * (1 + self.use_next_obs_in_context) + self.action_dim + 1
         self.encoder = self.encoder_class(context_dim, self.latent_dim, self.encoder_arch, self.activation_fn)
         self.reward_model = RewardModel(self.obs_dim, self.action_dim, self.latent_dim)
         for network in (self.encoder, self.reward_model):
@@ -195,6 +199,7 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
             encoder_arch=self.encoder_arch,
             encoder_class=self.encoder_class,
             latent_dim=self.latent_dim,
+            use_next_obs_in_context=self.use_next_obs_in_context,
             normalize_observations=self.normalize_observations,
             **{key: data[key] for key in keys},
         )
@@ -227,8 +232,10 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
         :param context: transitions as they were collected
         :return: (n_tasks, ...), with these taken in
         """
-        rows = th.cat([self.normalize(context.observations), context.actions, context.rewards[:, None]], dim=1)
-        return self.encoder.extend(state, rows, context.lengths)
+        columns = [self.normalize(context.observations), context.actions, context.rewards[:, None]]
+        if self.use_next_obs_in_context:
+            columns.append(self.normalize(context.next_observations))
+        return self.encoder.extend(state, th.cat(columns, dim=1), context.lengths)
 
     def infer(self, context: Context) -> tuple[th.Tensor, th.Tensor]:
         """

@@ -39,6 +39,8 @@ NUMBERS = (
     *("n_tasks_per_rollout", "n_episodes_per_task", "buffer_size"),
 )
 FLAG = "cuda_graph"
+# Truth values among those of its policy, and what they are where a file says nothing of them
+POLICY_FLAGS = {"normalize_observations": True, "use_next_obs_in_context": False}
 WORDS = {"ent_coef": LEARNT_ENT_COEF, "target_entropy": "auto", "matmul_precision": "highest|high|medium"}
 COUNTERS = ("num_timesteps", "_n_updates")
 # Arguments of the replay buffer that are plain data
@@ -203,7 +205,7 @@ def _check_policy_settings(given: dict[str, Any]) -> set[str]:
     :return: names of those that a file may have
     :raises Refused: if there are others
     """
-    known = {"latent_dim", "net_arch", "encoder_arch", "n_critics", "normalize_observations"}
+    known = {"latent_dim", "net_arch", "encoder_arch", "n_critics", *POLICY_FLAGS}
     if given.get("encoder_class") in list(ENCODERS):
         known.add("encoder_class")
     # SB3 marks some with a colon; and what says how weights are learnt says nothing of those in a file
@@ -230,7 +232,7 @@ def _policy_kwargs(given: dict[str, Any]) -> dict[str, Any]:
         whole = isinstance(units, list) and all(type(unit) is int and 1 <= unit <= MAX_UNITS for unit in units)
         if not whole or len(units) > MAX_LAYERS:
             raise Refused(f"PEARL's networks do not have layers of {units} units.")
-    return {**kwargs, "normalize_observations": bool(kwargs.get("normalize_observations", True))}
+    return {**kwargs, **{name: bool(kwargs.get(name, default)) for name, default in POLICY_FLAGS.items()}}
 
 
 def _check_shapes(path: str | os.PathLike[str], weights: dict[str, Any], env: GymEnv, policy_kwargs: dict[str, Any]) -> None:

@@ -12,7 +12,7 @@ import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
 
-from helpers import ENV_ID, MakePEARL
+from helpers import ENV_ID, MakePEARL, with_policy
 from helpers.adaptations import begin, know_tasks, play, step, walk
 from sb3_htr import PEARL
 from sb3_htr.adaptation import Aggregate, Belief, LearnedPrior
@@ -145,10 +145,25 @@ def test_the_posterior_of_prior_is_over_all_episodes(tiny_pearl: MakePEARL) -> N
     obs = th.tensor([[0.0], [0.1], [0.2]]).tile(3, 2)
     rewards = th.tensor([1.0, 0, 0, 0, 0, 0, 2, 0, 0])
     with th.no_grad():
-        expected = model.policy.infer(Context(obs, obs, rewards, th.tensor([9])))
+        expected = model.policy.infer(Context(obs, obs, rewards, obs, th.tensor([9])))
     mean, deviation = adaptation.posterior()
     np.testing.assert_allclose(mean, expected[0], rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(deviation, expected[1].sqrt(), rtol=1e-4)
+
+
+def test_an_adaptation_infers_from_what_its_steps_led_to(tiny_pearl: MakePEARL) -> None:
+    """Where the policy asks for it; over several episodes, which end elsewhere than the next one begins."""
+    model = tiny_pearl(policy_kwargs=with_policy(use_next_obs_in_context=True))
+    adaptation = begin(model, "prior")
+    obs, next_obs = np.random.default_rng(0).uniform(-1, 1, (2, 6, 1, 2)).astype(np.float32)
+    for i in range(6):
+        adaptation.observe(step(obs[i], [0.0], i % 3 == 2)._replace(next_observations=next_obs[i]))
+    before, after = (th.from_numpy(x[:, 0]) for x in (obs, next_obs))
+    with th.no_grad():
+        mean, _ = model.policy.infer(Context(before, before, th.zeros(6), after, th.tensor([6])))
+        other, _ = model.policy.infer(Context(before, before, th.zeros(6), before, th.tensor([6])))
+    np.testing.assert_allclose(adaptation.posterior()[0], mean, rtol=1e-4, atol=1e-6)
+    assert not np.allclose(mean, other, rtol=0.01)
 
 
 def test_what_exploration_alone_found_is_in_the_final_z(tiny_pearl: MakePEARL) -> None:
@@ -191,7 +206,7 @@ def test_a_long_episode_narrows_the_posterior_as_much_as_a_context_of_training(t
         adaptation.observe(step(row[:, :2], [1.0], i == 49, actions=row[:, 2:]))
     obs, actions = (th.tensor(rows[[9, 19, 29, 39, 49], 0, columns]) for columns in (slice(0, 2), slice(2, 4)))
     with th.no_grad():
-        _, variance = model.policy.infer(Context(obs, actions, th.ones(5), th.tensor([5])))
+        _, variance = model.policy.infer(Context(obs, actions, th.ones(5), obs, th.tensor([5])))
     np.testing.assert_allclose(adaptation.posterior()[1], variance.sqrt(), rtol=1e-5)
 
 
@@ -204,7 +219,7 @@ def test_a_goal_that_was_passed_between_two_steps_of_a_context_is_in_it(tiny_pea
     kept = [9, 23, 29, 39, 49]
     obs, actions = (th.tensor(rows[kept, 0, columns]) for columns in (slice(0, 2), slice(2, 4)))
     with th.no_grad():
-        mean, _ = model.policy.infer(Context(obs, actions, th.tensor([0.0, 6, 0, 0, 0]), th.tensor([5])))
+        mean, _ = model.policy.infer(Context(obs, actions, th.tensor([0.0, 6, 0, 0, 0]), obs, th.tensor([5])))
     np.testing.assert_allclose(adaptation.posterior()[0], mean, rtol=1e-4, atol=1e-6)
 
 

@@ -54,6 +54,7 @@ from sb3_htr.common.vec_env import make_task_vec_env
         ({"policy_kwargs": {"n_critics": 0}}, "n_critics is 0, expected a whole number of at least 1"),
         ({"policy_kwargs": {"activation_fn": "ReLU"}}, r"activation_fn is 'ReLU', expected a class derived from torch\.nn"),
         ({"policy_kwargs": {"optimizer_class": "Adam"}}, r"optimizer_class is 'Adam', expected a class derived from torch\."),
+        ({"policy_kwargs": {"use_next_obs_in_context": 1.5}}, "use_next_obs_in_context is 1.5, expected True or False"),
         ({"policy_kwargs": {"normalize_observations": "no"}}, "normalize_observations is 'no', expected True or False"),
         ({"policy_kwargs": {"use_sde": True}}, "policy_kwargs has no setting 'use_sde'"),
         ({"policy_kwargs": {"lr_schedul": 1}}, "policy_kwargs has no setting 'lr_schedul': expected one of"),

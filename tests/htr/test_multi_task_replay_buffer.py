@@ -134,6 +134,12 @@ def test_what_is_drawn_has_the_types_and_shapes_of_the_docstring(relabeller: str
     assert data.next_observations.shape == (24, 2) and data.dones.shape == (24,)
 
 
+@both_relabellers
+def test_contexts_tell_where_their_steps_led(relabeller: str) -> None:
+    context = filled(n_episodes=12, relabel_probability=0.5, relabeller=relabeller).sample(4, meta_batch_size=32).context
+    np.testing.assert_allclose(context.next_observations, context.observations + 0.1 * context.actions, atol=1e-6)
+
+
 def test_a_cost_that_no_task_has_a_part_in_hides_no_missing_reward() -> None:
     buffer = filled(relabel_probability=0.5)
     columns = buffer.transitions

@@ -160,7 +160,7 @@ def test_an_untrusted_model_acts_as_the_one_that_was_saved(tiny_pearl: MakePEARL
     replay = {"relabeller": {"name": "EpisodeClustering", "cell_size": 0.3}, "relabel_probability": 0.4}
     rate = LinearSchedule(2e-3, 1e-4, 0.5)
     settings = {"learning_rate": rate, "replay_buffer_kwargs": replay, **explorers}
-    policy_kwargs = with_policy(encoder_class="PriorFactorEncoder")
+    policy_kwargs = with_policy(encoder_class="PriorFactorEncoder", use_next_obs_in_context=True)
     settings |= {"n_steps": 2, "final_kl_coef": 0.03, "policy_kwargs": policy_kwargs}
     model = tiny_pearl(gamma=0.7, kl_coef=0.02, context_size=7, **settings).learn(3 * ROLLOUT)
     model.save(tmp_path / "model.zip")

@@ -64,13 +64,20 @@ def test_every_network_sees_normalized_observations(trained: PEARL, tiny_pearl: 
     np.testing.assert_allclose(ours, plain.predict(by_hand, (z,), deterministic=True)[0], atol=1e-5)
     actions, rewards, lengths = th.from_numpy(z[:, :2]), th.ones(9), th.tensor([4, 5])
     with th.no_grad():
-        a = trained.policy.infer(Context(th.from_numpy(obs), actions, rewards, lengths))
-        b = plain.policy.infer(Context(th.from_numpy(by_hand), actions, rewards, lengths))
+        a, b = (
+            model.policy.infer(Context(th.from_numpy(seen), actions, rewards, th.from_numpy(seen), lengths))
+            for model, seen in ((trained, obs), (plain, by_hand))
+        )
     for x, y in zip(a, b, strict=True):
         th.testing.assert_close(x, y, rtol=1e-4, atol=1e-5)
 
 
-def test_a_context_row_is_observation_action_reward(trained: PEARL, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("with_next_obs", [False, True])
+def test_a_context_row_is_observation_action_reward(
+    with_next_obs: bool, tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And, where that is asked for, the observation that followed."""
+    trained = tiny_pearl(policy_kwargs=with_policy(use_next_obs_in_context=with_next_obs)).learn(2 * ROLLOUT)
     read: list[th.Tensor] = []
 
     def extend(state: th.Tensor, rows: th.Tensor, lengths: th.Tensor) -> th.Tensor:
@@ -78,9 +85,10 @@ def test_a_context_row_is_observation_action_reward(trained: PEARL, monkeypatch:
         return state
 
     monkeypatch.setattr(trained.policy.encoder, "extend", extend)
-    obs, actions = th.tensor([[0.3, 0.2]]), th.tensor([[-0.5, 1.0]])
-    trained.policy.infer(Context(obs, actions, th.tensor([6.0]), th.tensor([1])))
-    assert th.equal(read[0], th.cat([normalizer(trained)(obs), actions, th.tensor([[6.0]])], dim=1))
+    obs, actions, next_obs = th.tensor([[0.3, 0.2]]), th.tensor([[-0.5, 1.0]]), th.tensor([[0.25, 0.3]])
+    trained.policy.infer(Context(obs, actions, th.tensor([6.0]), next_obs, th.tensor([1])))
+    expected = [normalizer(trained)(obs), actions, th.tensor([[6.0]]), normalizer(trained)(next_obs)]
+    assert th.equal(read[0], th.cat(expected[: 3 + with_next_obs], dim=1))
 
 
 def test_updates_see_normalized_observations(trained: PEARL, monkeypatch: pytest.MonkeyPatch) -> None:

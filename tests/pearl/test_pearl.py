@@ -50,6 +50,7 @@ class Counter(BaseCallback):
         {"target_update_interval": 2, "explorer": PRIOR, "train_explorer": PRIOR},
         {"train_explorer": "belief"},
         {"policy_kwargs": with_policy(normalize_observations=False)},
+        {"policy_kwargs": with_policy(use_next_obs_in_context=True)},
         {"reward_coef": 0.0},
         {"n_steps": 5},
         {"final_kl_coef": 0.1, "policy_kwargs": with_policy(encoder_class="PriorFactorEncoder")},

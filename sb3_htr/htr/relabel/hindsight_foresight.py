@@ -5,7 +5,6 @@ import torch as th
 
 from sb3_htr.common.settings import check_numbers
 from sb3_htr.common.task_reward import task_reward
-from sb3_htr.common.type_aliases import Context
 from sb3_htr.htr.groups import evenly_spread, first_rows, positions
 from sb3_htr.htr.relabel.training_task import TrainingTaskRelabelling
 
@@ -55,8 +54,8 @@ class HindsightForesight(TrainingTaskRelabelling):
         steps, taken = evenly_spread(repeated, self.context_size, gains)
         at = steps + np.repeat(first_rows(repeated), taken)
         row, task = row[at], task[at]
-        arrays = rows[row, columns.observation], rows[row, columns.action], rewards[task, row], taken
-        mean, _ = policy.infer(Context(*(th.as_tensor(array, device=policy.device) for array in arrays)))
+        context = columns.context(rows[row], taken, policy.device)
+        mean, _ = policy.infer(context._replace(rewards=th.as_tensor(rewards[task, row], device=policy.device)))
         z = mean.reshape(n_episodes, n_tasks, -1).repeat(n_starts, 1, 1)
         values = policy.values(np.repeat(starts, n_episodes, axis=0), z)
         return np.asarray(values.reshape(n_starts, n_episodes, n_tasks).mean(dim=0).cpu().numpy(), dtype=np.float64)
