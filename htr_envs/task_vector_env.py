@@ -67,13 +67,13 @@ class TaskVectorEnv(HasRewardHooks, VectorEnv[FloatArray, FloatArray, NDArray[An
         self.action_space = batch_space(single_action_space, num_envs)
 
         task_shape = (num_envs, *task_family.train_tasks.shape[1:])
-        self._given = np.zeros(num_envs, dtype=np.bool_)
-        self._given_ids = np.full(num_envs, -1, dtype=np.int64)
+        self._is_task_given = np.zeros(num_envs, dtype=np.bool_)
+        self._given_task_ids = np.full(num_envs, -1, dtype=np.int64)
         self._given_tasks = np.zeros(task_shape, dtype=np.float32)
-        self._task_ids = np.full(num_envs, -1, dtype=np.int64)
-        self._tasks = np.zeros(task_shape, dtype=np.float32)
+        self._ids_of_episodes = np.full(num_envs, -1, dtype=np.int64)
+        self._tasks_of_episodes = np.zeros(task_shape, dtype=np.float32)
         self._elapsed_steps = np.zeros(num_envs, dtype=np.int64)
-        self._observations: FloatArray | None = None
+        self._last_observations: FloatArray | None = None
 
     @abstractmethod
     def _reset_state(self, indices: NDArray[np.int64]) -> FloatArray:
@@ -109,22 +109,22 @@ class TaskVectorEnv(HasRewardHooks, VectorEnv[FloatArray, FloatArray, NDArray[An
                     f"indices are {indices!r}: pass whole numbers below {self.num_envs}, or a mask of {self.num_envs} bools."
                 ) from None
         if tasks is None:
-            self._given[chosen] = False
+            self._is_task_given[chosen] = False
             return
         values = np.full(len(chosen), tasks) if np.ndim(tasks) == 0 else tasks
         if np.ndim(values) == 1 and np.size(values) and np.asarray(values).dtype.kind == "f":
-            shape = (len(chosen), *self._tasks.shape[1:])
+            shape = (len(chosen), *self._tasks_of_episodes.shape[1:])
             raise ValueError(f"The tasks {tasks!r} are no whole numbers, as ids are: vectors need the shape {shape}.")
-        self._give("task" if np.ndim(values) > 1 else "task_id", values, chosen)
+        self._give_tasks("task" if np.ndim(values) > 1 else "task_id", values, chosen)
 
-    def _give(self, key: str, value: Any, indices: NDArray[np.int64]) -> None:
+    def _give_tasks(self, key: str, value: Any, indices: NDArray[np.int64]) -> None:
         if key == "task_id":
             task_ids = self.task_family.task_indices(value, indices.shape)
-            self._given_ids[indices], self._given_tasks[indices] = task_ids, self.task_family.train_tasks[task_ids]
+            self._given_task_ids[indices], self._given_tasks[indices] = task_ids, self.task_family.train_tasks[task_ids]
         else:
-            vectors = self.task_family.task_vectors(value, indices.shape + self._tasks.shape[1:])
-            self._given_ids[indices], self._given_tasks[indices] = -1, vectors
-        self._given[indices] = True
+            vectors = self.task_family.task_vectors(value, indices.shape + self._tasks_of_episodes.shape[1:])
+            self._given_task_ids[indices], self._given_tasks[indices] = -1, vectors
+        self._is_task_given[indices] = True
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[FloatArray, dict[str, Any]]:
         """Start an episode in every copy.
@@ -139,20 +139,22 @@ class TaskVectorEnv(HasRewardHooks, VectorEnv[FloatArray, FloatArray, NDArray[An
         everyone = np.arange(self.num_envs)
         check_seed(seed)
         if chosen is not None:
-            self._give(*chosen, everyone)
+            self._give_tasks(*chosen, everyone)
         super().reset(seed=seed)  # not before: a reset that is refused changes nothing
         self.closed = False  # what steps now can be closed again
         assert self.single_observation_space.shape is not None
-        self._observations = np.zeros((self.num_envs, *self.single_observation_space.shape), dtype=np.float32)
-        self._begin_episodes(self._observations, everyone)
-        return self._observations.copy(), {"task_id": self.task_ids}
+        self._last_observations = np.zeros((self.num_envs, *self.single_observation_space.shape), dtype=np.float32)
+        self._begin_episodes(self._last_observations, everyone)
+        return self._last_observations.copy(), {"task_id": self.task_ids}
 
     def _begin_episodes(self, observations: FloatArray, indices: NDArray[np.int64]) -> None:
         # drawn for all of them even if it is not used, for the reason given in MetaEnv.reset
         drawn = self.np_random.integers(len(self.task_family.train_tasks), size=len(indices))
-        given = self._given[indices]
-        self._task_ids[indices] = np.where(given, self._given_ids[indices], drawn)
-        self._tasks[indices] = np.where(given[:, None], self._given_tasks[indices], self.task_family.train_tasks[drawn])
+        given = self._is_task_given[indices]
+        self._ids_of_episodes[indices] = np.where(given, self._given_task_ids[indices], drawn)
+        self._tasks_of_episodes[indices] = np.where(
+            given[:, None], self._given_tasks[indices], self.task_family.train_tasks[drawn]
+        )
         self._elapsed_steps[indices] = 0
         states, expected = self._reset_state(indices), (len(indices), *observations.shape[1:])
         if states is None or np.shape(states) != expected:
@@ -168,12 +170,12 @@ class TaskVectorEnv(HasRewardHooks, VectorEnv[FloatArray, FloatArray, NDArray[An
         :raises ValueError: if the actions have the wrong shape, or are not finite; or for what ``_step_state`` may not return.
         :raises gymnasium.error.ResetNeeded: before the first reset.
         """
-        if self._observations is None:
+        if self._last_observations is None:
             raise ResetNeeded("step was called before the first reset: call reset() first.")
         actions = checked_action(actions, self.action_space)
         stepped = self._step_state(actions)
         given = tuple(map(np.shape, stepped)) if isinstance(stepped, tuple | list) else f"a {type(stepped).__name__}"
-        expected = (self._observations.shape, (self.num_envs,), (self.num_envs,))
+        expected = (self._last_observations.shape, (self.num_envs,), (self.num_envs,))
         if given != expected:
             raise ValueError(
                 "_step_state returns observations, task-free rewards and terminations, one of each for each env: expected "
@@ -189,11 +191,13 @@ class TaskVectorEnv(HasRewardHooks, VectorEnv[FloatArray, FloatArray, NDArray[An
             )
         final_obs = np.array(states, dtype=np.float32)
         # an axis of T = 1 makes every copy a trajectory of its own, with its own task
-        traj = Trajectory(*(values[:, None] for values in (self._observations, actions, final_obs, task_free_reward)))
-        rewards = self.task_family.compute_reward(traj, self._tasks, self.reward_type)
+        traj = Trajectory(*(values[:, None] for values in (self._last_observations, actions, final_obs, task_free_reward)))
+        rewards = self.task_family.compute_reward(traj, self._tasks_of_episodes, self.reward_type)
         rewards = told_by_hook("compute_reward", rewards, (self.num_envs, 1))[:, 0]
-        successes = told_by_hook("is_success", self.task_family.is_success(traj, self._tasks), (self.num_envs, 1))[:, 0]
-        achieved = told_by_hook("hindsight_task", self.task_family.hindsight_task(traj, 0), self._tasks.shape)
+        successes = told_by_hook("is_success", self.task_family.is_success(traj, self._tasks_of_episodes), (self.num_envs, 1))[
+            :, 0
+        ]
+        achieved = told_by_hook("hindsight_task", self.task_family.hindsight_task(traj, 0), self._tasks_of_episodes.shape)
         self._elapsed_steps += 1
         truncated = np.zeros(self.num_envs, dtype=np.bool_)
         if self.max_episode_steps is not None:
@@ -207,23 +211,23 @@ class TaskVectorEnv(HasRewardHooks, VectorEnv[FloatArray, FloatArray, NDArray[An
             "final_obs": final_obs,
             "_final_obs": done,
         }
-        self._observations = final_obs.copy()
+        self._last_observations = final_obs.copy()
         if done.any():
-            self._begin_episodes(self._observations, np.flatnonzero(done))
-        return self._observations.copy(), rewards, np.array(terminated), truncated, infos
+            self._begin_episodes(self._last_observations, np.flatnonzero(done))
+        return self._last_observations.copy(), rewards, np.array(terminated), truncated, infos
 
     @property
     def tasks(self) -> FloatArray:
         """Tasks of the current episodes, shape (num_envs, task_dim), a copy."""
         self._check_begun()
-        return self._tasks.copy()
+        return self._tasks_of_episodes.copy()
 
     @property
     def task_ids(self) -> NDArray[np.int64]:
         """Indices of the current episodes' tasks in ``train_tasks``, -1 for a task given as a vector, (num_envs,), a copy."""
         self._check_begun()
-        return self._task_ids.copy()
+        return self._ids_of_episodes.copy()
 
     def _check_begun(self) -> None:
-        if self._observations is None:
+        if self._last_observations is None:
             raise ResetNeeded("The envs have no tasks before their first reset: call reset() first.")

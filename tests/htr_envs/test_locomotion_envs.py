@@ -268,7 +268,7 @@ def test_a_state_that_is_not_finite_ends_the_episode_with_finite_numbers(
 def test_the_wheeled_robots_observation_is_that_of_the_docstring() -> None:
     vector = WheeledVectorEnv(num_envs=3)
     vector.reset(seed=0)
-    before = vector._observations
+    before = vector._last_observations
     assert before is not None
     for actions in random_actions(vector, 50):
         after = vector.step(actions)[0]
