@@ -11,7 +11,7 @@
     sb3-htr experiment turned_controls --gym-packages examples.experiments
 
 All settings are the defaults, those of SparseAnt-v0 on both ants, but for the last three, in which nothing is relabelled and
-which have PEARL's own protocol, and for the variants of ant_goal that say so.
+which explore by PEARL's own prior, and for the variants of ant_goal that say so.
 """
 
 from examples import (  # noqa: F401 register the envs
@@ -112,7 +112,7 @@ EXPERIMENTS["dense_context"] = Experiment(
     evaluations=by(("prior",)),
 )
 
-# Tasks that change the dynamics: what it is worth that contexts tell where a step led, and for which rewards
+# Tasks that change the dynamics: how much o' in contexts helps, with sparse rewards and with dense ones
 EXPERIMENTS["turned_controls"] = Experiment(
     "turned_controls",
     "Plain PEARL where tasks change the dynamics, with and without the next observation in contexts.",

@@ -2,9 +2,9 @@
 
     python examples/walker_random_params.py      # meta-train by plain PEARL and adapt; hours on one core
 
-PEARL's walker-rand-params, but for the walker, which is gymnasium's: it acts every four physics steps, theirs every five; and
-but for contexts, which there have the next observation, too. The reward is the same in all tasks, and old experience says
-nothing about another body: there is nothing to relabel.
+PEARL's walker-rand-params, but for the walker, which is gymnasium's: it acts every four physics steps, theirs every five. The
+reward is the same in all tasks, and old experience says nothing about another body: there is nothing to relabel. Contexts have
+the next observation, too.
 """
 
 from typing import Any, ClassVar
@@ -93,6 +93,7 @@ if __name__ == "__main__":
     # One episode with a z of the prior, then of the posterior
     prior = {"name": "prior", "n_exploration_episodes": 1}
     plain: dict[str, Any] = {"replay_buffer_kwargs": {"relabel_probability": 0.0}, "explorer": prior, "train_explorer": prior}
+    plain["policy_kwargs"] = {"use_next_obs_in_context": True}
     model = PEARL("MlpPolicy", "WalkerRandomParams-v0", **plain, n_episodes_per_task=3, context_size=100, seed=0, verbose=1)
     returns, _ = evaluate_adaptation(model.learn(1_000_000), "WalkerRandomParams-v0", n_episodes=3)
     print(f"return of episodes 1 to 3: {returns.mean(axis=0).round(1)}")

@@ -70,7 +70,7 @@ def test_rewards_that_no_family_tells_may_be_any(tiny_pearl: MakePEARL) -> None:
     rows = model.replay_buffer.episodes.take(np.arange(model.replay_buffer.size()))
     columns = model.replay_buffer.transitions
     np.testing.assert_allclose(rows[:, columns.reward], 100 * rows[:, columns.next_observation][:, 0], rtol=1e-5)
-    with pytest.raises(ValueError, match="NormalizeReward stands between the env and relabelled rewards"):
+    with pytest.raises(ValueError, match="NormalizeReward stands between the env and what is learned from"):
         tiny_pearl(gym.wrappers.NormalizeReward(make_cart()), **PLAIN)
 
 

@@ -297,7 +297,7 @@ def check_is_not_normalized(env: VecEnv) -> None:
         name = "VecNormalize"
     if name is not None:
         raise ValueError(
-            f"{name} stands between the env and relabelled rewards, and is not saved with the model: leave it out. "
+            f"{name} stands between the env and what is learned from, and is not saved with the model: leave it out. "
             "PEARL's and RL2's policies normalize observations themselves (normalize_observations of policy_kwargs). Rewards "
             "cannot be normalized: all tasks share one scale."
         )

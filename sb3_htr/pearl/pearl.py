@@ -89,7 +89,7 @@ class PEARL(OffPolicyMetaAlgorithm):
     :param stats_window_size: episodes over which logged returns are averaged
     :param tensorboard_log: folder for TensorBoard, none by default
     :param policy_kwargs: arguments of the policy: ``latent_dim``, ``net_arch``, ``encoder_arch`` (paper: 5, 3x300, 3x200),
-        ``normalize_observations``, ``use_next_obs_in_context`` and others
+        ``normalize_observations``, and all that :class:`PEARLPolicy` has
     :param verbose: 0 nothing, 1 info, 2 debug
     :param seed: seed of all random generators, from 0 to 2**32 - 1
     :param device: torch device

@@ -79,6 +79,8 @@ def test_the_context_of_a_task_is_that_of_its_adaptation(monkeypatch: pytest.Mon
     # After those of the adaptation, one of each task that was solved
     n_solved = round(bins[:, 0].sum() / (6 * 3 * 20))
     assert n_solved and all(context.rewards.max() > 0 for context in seen[-n_solved:])
+    for context in seen[-n_solved:]:
+        np.testing.assert_allclose(context.next_observations, context.observations + 0.1 * context.actions, atol=1e-6)
 
 
 @pytest.mark.parametrize("module", [calibration_module, protocol])

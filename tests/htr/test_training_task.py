@@ -158,6 +158,7 @@ def test_foresight_is_the_value_of_the_policy_that_has_adapted() -> None:
     assert utilities.shape == (3, 80)
     (context,) = seen["contexts"]
     assert context.lengths.tolist() == [length for length in (10, 7, 10) for _ in range(80)]
+    np.testing.assert_allclose(context.next_observations, context.observations + 0.1 * context.actions, atol=1e-6)
     places = by_task(rows[:, buffer.transitions.next_observation], lengths)
     for i, (episode, every) in enumerate(zip(places, (2, 1, 2), strict=True)):
         distance = np.linalg.norm(episode[every - 1 :: every, None] - FAMILY.train_tasks, axis=-1)

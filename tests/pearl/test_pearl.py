@@ -332,7 +332,7 @@ def test_a_loaded_model_collects_on_tasks_of_its_new_env(tiny_pearl: MakePEARL, 
 
 
 def test_the_policy_can_be_saved_alone(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
-    model = tiny_pearl().learn(ROLLOUT)
+    model = tiny_pearl(policy_kwargs=with_policy(use_next_obs_in_context=True)).learn(ROLLOUT)
     model.policy.save(str(tmp_path / "policy"))
     policy = type(model.policy).load(str(tmp_path / "policy"))
     obs, z = np.ones((1, 2), dtype=np.float32), np.ones((1, 3), dtype=np.float32)
