@@ -96,7 +96,8 @@ def test_the_weight_of_the_kl_term_grows_by_the_same_factor_in_equal_times(tiny_
 
 def test_critics_discount_what_follows_by_the_steps_before_it(tiny_pearl: MakePEARL, monkeypatch: Any) -> None:
     """And SB3 does not warn of a buffer that has no n-step returns, as this one has."""
-    with warnings.catch_warnings(action="error"):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
         model = tiny_pearl(n_steps=3)
     model.learn(ROLLOUT)
     assert model.replay_buffer is not None
