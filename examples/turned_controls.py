@@ -4,8 +4,8 @@
     sb3-htr experiment turned_controls --gym-packages examples.experiments
 
 As a robot whose camera or compass was mounted askew. The reward is the same function of a step in all tasks, and old
-experience says nothing of another angle: there is nothing to relabel. One whole step (o, a, o') tells the angle. With dense
-rewards, a few of (o, a, r) do so as well; with sparse ones, they hardly do.
+experience says nothing of another angle: there is nothing to relabel. One whole step (o, a, o') tells the angle, (o, a, r)
+does not.
 """
 
 from typing import Any
@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium import spaces
 
 from htr_envs import MetaEnv, TaskDistribution
-from htr_envs.task_env import FloatArray
+from htr_envs.task_env import FloatArray, check_reward_type
 
 # How far a step leads along each axis, from where on the goal is reached, and where in the plane starts and goals are
 STEP, RADIUS, HALF = 0.1, 0.2, 0.5
@@ -48,6 +48,7 @@ class TurnedControlsEnv(MetaEnv):
     """
 
     def __init__(self, reward_type: str = "dense", **family_kwargs: Any) -> None:
+        check_reward_type(reward_type)
         super().__init__(AngleDistribution(**family_kwargs))
         self.reward_type = reward_type
         self.observation_space = spaces.Box(-np.inf, np.inf, (4,), np.float32)
