@@ -1,6 +1,6 @@
 """A family whose tasks change the dynamics: a point that sees its goal, and whose controls are turned by a hidden angle.
 
-    python examples/turned_controls.py      # meta-train by plain PEARL, whose contexts have o', and adapt; minutes on one core
+    python examples/turned_controls.py      # floor and ceiling; meta-train by plain PEARL, whose contexts have o', and adapt
     sb3-htr experiment turned_controls --gym-packages examples.experiments
 
 As a robot whose camera or compass was mounted askew. The reward is the same function of a step in all tasks, and old
@@ -69,12 +69,31 @@ class TurnedControlsEnv(MetaEnv):
         return np.concatenate([self.position, self.goal]).astype(np.float32)
 
 
+def turn_back(observations: np.ndarray, tasks: np.ndarray) -> np.ndarray:
+    """
+    :param observations: (n, 4)
+    :param tasks: (n, 1) angles
+    :return: (n, 2) actions of one that is told them: straight to the goals, as fast as it goes
+    """
+    x, y = ((observations[:, 2:] - observations[:, :2]) / STEP).T
+    cos, sin = np.cos(tasks[:, 0]), np.sin(tasks[:, 0])
+    steps = np.stack([cos * x + sin * y, cos * y - sin * x], axis=1)
+    return steps / np.maximum(np.abs(steps).max(axis=1, keepdims=True), 1)
+
+
 gym.register("TurnedControls-v0", entry_point=TurnedControlsEnv, max_episode_steps=20)
 
 
 if __name__ == "__main__":
     from sb3_htr import PEARL, evaluate_adaptation
+    from sb3_htr.rivals.scripted import ScriptedAgent
 
+    print("| rewards | actions | return of an episode |\n| --- | --- | --- |")
+    for reward_type in ("sparse", "dense"):
+        env = gym.make("TurnedControls-v0", reward_type=reward_type)
+        for name, script in (("random actions", None), ("turn_back", turn_back)):
+            returns, _ = evaluate_adaptation(ScriptedAgent(env.action_space, script), env, n_episodes=250)
+            print(f"| {reward_type} | {name} | {returns.mean():.2f} |")
     # One episode with a z of the prior, then of the posterior
     prior = {"name": "prior", "n_exploration_episodes": 1}
     plain: dict[str, Any] = {"replay_buffer_kwargs": {"relabel_probability": 0.0}, "explorer": prior, "train_explorer": prior}

@@ -17,8 +17,9 @@ from gymnasium.error import DependencyNotInstalled
 
 from helpers import TINY, with_policy
 from htr_envs import check_task_env
-from sb3_htr import PEARL
+from sb3_htr import PEARL, evaluate_adaptation
 from sb3_htr.common.vec_env import make_task_vec_env
+from sb3_htr.rivals.scripted import ScriptedAgent
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 FAMILIES = {
@@ -152,6 +153,16 @@ def test_a_window_without_a_screen_is_refused(module: str, monkeypatch: pytest.M
     env_class: Any = type(gym.make({**FAMILIES, **DEPENDENT}[module]).unwrapped)
     with pytest.raises(DependencyNotInstalled, match="needs a screen, and there is none"):
         env_class(render_mode="human")
+
+
+def test_one_that_is_told_how_its_controls_are_turned_holds_its_goal() -> None:
+    example = importlib.import_module("examples.turned_controls")
+    env = gym.make("TurnedControls-v0", reward_type="sparse")
+    returns = [
+        evaluate_adaptation(ScriptedAgent(env.action_space, script), env, n_episodes=20)[0]
+        for script in (None, example.turn_back)
+    ]
+    assert returns[0].mean() < 4 < 16 < returns[1].mean() and returns[1].min() > 9
 
 
 def test_successes_of_the_dense_point_robot_are_those_of_the_sparse_one() -> None:

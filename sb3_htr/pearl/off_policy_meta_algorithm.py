@@ -263,7 +263,7 @@ class OffPolicyMetaAlgorithm(MetaTest, ReplayFiles, CheckedFiles, SAC):
         :param env: env of the same spaces and number of copies; its task family replaces the old one if nothing was collected
         :param force_reset: reset before training goes on
         :raises ValueError: if there is experience of another task family or of shorter episodes, or something changes rewards
-            that the family tells; others, nobody can compare with those of the experience
+            that the family tells. Where it tells none, rewards that differ from those of the experience are not noticed
         """
         vec_env = self._wrap_env(env)
         checks.check_rewards(vec_env)
