@@ -1,6 +1,7 @@
-"""The default explorer with one of its parts taken out. They are experiments, and not for use."""
+"""The default explorer with one of its parts taken out, or with none left. They are experiments, and not for use."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch as th
@@ -66,6 +67,38 @@ class NoInference(Belief):
         pass
 
 
+@dataclass
+class InTurn(Explorer):
+    """
+    No inference, no critics, no model: the training tasks that were solved are tried one after another, an episode each. The
+    first is in the middle, each next one is the furthest from all before, by z. The first z that is rewarded is kept.
+    """
+
+    needs_success: ClassVar[bool] = True
+
+    def start(self) -> None:
+        z, *_, is_train = self.adaptation.knowledge.particles()
+        known = z[is_train].cpu().numpy() if is_train.any() else np.zeros((1, z.shape[1]), dtype=np.float32)
+        distances = np.linalg.norm(known[:, None] - known, axis=-1)
+        nearest = -np.linalg.norm(known - known.mean(axis=0), axis=1)
+        order: list[int] = []
+        while len(order) < len(known):
+            order.append(int(nearest.argmax()))
+            nearest = distances[order].min(axis=0)
+        self._known = known[order]
+        self._turn = np.zeros(self.adaptation.n_envs, dtype=np.int64)
+        self._found = np.zeros(self.adaptation.n_envs, dtype=bool)
+        self.z = self._known[self._turn]
+
+    def observe(self, step: Step) -> None:
+        self._found |= step.dones & (self.adaptation.episode_return > 0)
+        self._turn += step.dones & ~self._found
+        self.z = self._known[self._turn % len(self._known)]
+
+    def exploring(self) -> np.ndarray:
+        return ~self._found
+
+
 ABLATIONS: dict[str, Explorer] = {
     "belief, training tasks alone": TrainingTasksAlone(),
     "belief, uniform prior": UniformPrior(),
@@ -73,4 +106,5 @@ ABLATIONS: dict[str, Explorer] = {
     "belief, no value": NoValue(),
     "belief, no giving up": NoGivingUp(),
     "belief, no inference": NoInference(),
+    "training tasks in turn": InTurn(),
 }

@@ -241,6 +241,16 @@ ALL = (
         figure=figures.evaluations,
     ),
     Experiment(
+        "ant_ablation",
+        "What is left of adaptation without inference, with models of an ant.",
+        ANT,
+        600_000,
+        tuple(map(Variant, ("htr-ser", "pearl-dense"))),
+        eval_freq=100_000,
+        evaluations=by(("training tasks in turn",)),
+        models_of="ant",
+    ),
+    Experiment(
         "wheeled",
         "HTR on a robot with wheels, against other rewards, other ways to relabel and to adapt, and one that is told more.",
         WHEELED,

@@ -7,7 +7,15 @@ import torch as th
 from helpers import ENV_ID
 from helpers.adaptations import begin, know_tasks, play, walk
 from sb3_htr import PEARL
-from sb3_htr.experiments.ablations import ABLATIONS, NoInference, NoPosterior, NoValue, TrainingTasksAlone, UniformPrior
+from sb3_htr.experiments.ablations import (
+    ABLATIONS,
+    InTurn,
+    NoInference,
+    NoPosterior,
+    NoValue,
+    TrainingTasksAlone,
+    UniformPrior,
+)
 
 
 @pytest.fixture
@@ -33,6 +41,12 @@ def test_the_parts_of_the_default_explorer(model: PEARL) -> None:
     assert isinstance(prior, UniformPrior) and prior.weights(np.arange(1)).tolist() == [[0.25] * 4]
     for name, explorer in ABLATIONS.items():
         assert 0 in places(model, explorer, 0.0), f"{name}: a training task is found"
+
+
+def test_training_tasks_in_turn(model: PEARL) -> None:
+    model.knowledge.is_train[2:4] = True
+    assert places(model, InTurn(), 7.0)[::3] == [1, 3, 0, 2, 1], "the middle, then the furthest from all that were tried"
+    assert places(model, InTurn(), 0.0)[::3] == [1, 3, 0, 0, 0], "what was rewarded is kept"
 
 
 def test_without_the_posterior_the_encoder_has_no_word(model: PEARL) -> None:
