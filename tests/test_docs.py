@@ -37,6 +37,7 @@ PAGES = [path for path in (ROOT / "README.md", *MANUAL) if python_blocks(path)]
 @pytest.mark.filterwarnings("ignore:No reward was found")
 def test_the_code_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    Path("results").symlink_to(ROOT / "results")  # a page reads what a checkout has
     monkeypatch.setattr(grid, "EXPERIMENTS", dict(grid.EXPERIMENTS))  # a page adds one
     # For a moment, where the page trains for seconds or minutes
     code = python_blocks(page).replace("model.learn()", "model.learn(8000)").replace("gradient_steps=100", "gradient_steps=5")
