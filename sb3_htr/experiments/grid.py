@@ -189,10 +189,10 @@ ALL = (
     ),
     Experiment(
         "paper_profile",
-        "The settings of the papers, and their protocol.",
+        "The settings of the papers, and their protocol: with relabelling, and with a dense reward, as PEARL was published.",
         POINT,
         1_000_000,
-        (Variant("htr-ser-prior", settings=settings_of("pearl_paper.yml")),),
+        tuple(Variant(method, settings=settings_of("pearl_paper.yml")) for method in ("htr-ser-prior", "pearl-dense-prior")),
         eval_freq=50_000,
         evaluations=by(("prior", "learned-prior", "belief")),
     ),
