@@ -37,7 +37,8 @@ class LatentPolicy(BasePolicy):
         :return: actions, and the state for the next call
         :raises ValueError: for a state that is none, and observations that are no finite numbers
         """
-        if observation is None or isinstance(observation, tuple):
+        with_info = isinstance(observation, tuple) and any(isinstance(part, dict) for part in observation)
+        if observation is None or with_info:
             return super().predict(observation, None, episode_start, deterministic)  # SB3 says what is wrong with it
         n = len(observation) if np.ndim(observation) > 1 else 1  # type: ignore[arg-type]
         if state is not None and not (

@@ -158,6 +158,15 @@ def test_observations_come_without_infos(tiny_pearl: MakePEARL) -> None:
         tiny_pearl().predict(gym.make(ENV_ID).reset())  # type: ignore[arg-type]
 
 
+@pytest.mark.filterwarnings("ignore:No reward was found")
+def test_an_observation_that_is_a_tuple_is_acted_on_by_the_same_z(tiny_pearl: MakePEARL) -> None:
+    agent = tiny_pearl().adapt(Robot(20), n_episodes=1)
+    for obs in ([0.5, -0.5], [[0.5, -0.5], [0.1, 0.2]]):
+        expected, _ = agent.predict(np.array(obs), deterministic=True)
+        actions, _ = agent.predict(tuple(obs), deterministic=True)  # type: ignore[arg-type]
+        np.testing.assert_array_equal(actions, expected)
+
+
 def test_no_action_follows_from_nothing(tiny_pearl: MakePEARL) -> None:
     agent = tiny_pearl().adapt(Robot(20), n_episodes=1)
     with pytest.raises(ValueError, match=r"The observation is \[nan  0\.\], expected finite numbers"):
