@@ -17,7 +17,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.errors import last_line
-from sb3_htr.common.settings import check_keywords, check_mappings, keywords_of
+from sb3_htr.common.settings import check_keywords, check_mappings, check_numbers, keywords_of
 
 # What SB3's models have in place of the setting ``policy``
 POLICY = "policy_class"
@@ -154,6 +154,8 @@ class CheckedFiles(BaseAlgorithm):
         return self.policy_aliases[policy_name]
 
     def _setup_model(self) -> None:
+        # Not in the constructor, as it can be given to load, too; of 0, logs would lack what they are to have
+        check_numbers(stats_window_size=(self._stats_window_size, 1))
         self._check_policy_class()
         super()._setup_model()  # type: ignore[safe-super]
 

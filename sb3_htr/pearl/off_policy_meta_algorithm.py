@@ -107,7 +107,6 @@ class OffPolicyMetaAlgorithm(MetaTest, ReplayFiles, CheckedFiles, SAC):
         check_numbers(
             n_tasks_per_rollout=(n_tasks_per_rollout, 1),
             verbose=(int(verbose) if isinstance(verbose, bool) else verbose, 0),
-            stats_window_size=(kwargs.get("stats_window_size", 1), 1),
         )
         check_mappings(replay_buffer_kwargs=replay_buffer_kwargs, policy_kwargs=policy_kwargs)
         if not isinstance(policy, str | type):  # a class of another kind is refused by CheckedFiles

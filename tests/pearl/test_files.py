@@ -373,6 +373,8 @@ def test_a_file_is_loaded_as_what_it_is_and_with_settings_that_are_known(tiny_pe
         PEARL.load(tmp_path / "model", tau=0.0)
     with pytest.raises(ValueError, match="context_size is 0, expected a whole number of at least 1"):
         PEARL.load(tmp_path / "model", context_size=0)
+    with pytest.raises(ValueError, match="stats_window_size is 0, expected a whole number of at least 1"):
+        PEARL.load(tmp_path / "model", stats_window_size=0)
     loaded = PEARL.load(tmp_path / "model", gamma=0.9, device="cpu", stats_window_size=7)
     assert loaded.gamma == 0.9 and loaded._stats_window_size == 7
     env = make_task_vec_env(ENV_ID, 3)

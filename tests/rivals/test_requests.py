@@ -52,6 +52,7 @@ def test_a_model_needs_an_env_for_its_networks(kind: Any) -> None:
         ({"learning_rate": -1e-3}, "learning_rate is -0.001, expected a number of at least 0"),
         ({"ent_coef": -1.0}, "ent_coef is -1.0, expected a number of at least 0"),
         ({"batch_size": 0}, "batch_size is 0, expected a whole number of at least 1"),
+        ({"stats_window_size": 0}, "stats_window_size is 0, expected a whole number of at least 1"),
         ({"sde_sample_freq": 4}, "has no setting 'sde_sample_freq': it is of use_sde"),
         ({"policy_kwargs": {"net_arch": "x"}}, r"net_arch is 'x', expected the hidden units of each layer"),
         ({"policy_kwargs": {"net_arch": {"pi": [8], "qf": [8, 0]}}}, r"qf is \[8, 0\], expected the hidden units"),
