@@ -67,7 +67,7 @@ def _checked_arch(net_arch: Any) -> list[int] | dict[str, list[int]]:
     if not isinstance(net_arch, dict):
         check_layers(net_arch=net_arch)
         return [*net_arch]
-    if not {"pi", "qf"} <= net_arch.keys():
+    if net_arch.keys() != {"pi", "qf"}:
         raise ValueError(f"net_arch is {net_arch}, expected layers for 'pi' and 'qf', or a list for both.")
     check_layers(**net_arch)
     return {name: [*units] for name, units in net_arch.items()}

@@ -66,9 +66,9 @@ from sb3_htr.common.vec_env import make_task_vec_env
             for name in ("net_arch", "encoder_arch")
             for units in (64, [64.0], [0], [True], "64")
         ),
-        (
-            {"policy_kwargs": {"net_arch": {"pi": [64]}}},
-            "net_arch is .*, expected layers for 'pi' and 'qf', or a list for both",
+        *(
+            ({"policy_kwargs": {"net_arch": layers}}, "net_arch is .*, expected layers for 'pi' and 'qf', or a list for both")
+            for layers in ({"pi": [64]}, {"pi": [64], "qf": [64], "encoder": [200]})
         ),
         ({"policy_kwargs": {"net_arch": {"pi": None, "qf": [64]}}}, "pi is None, expected the hidden units of each layer"),
         ({"policy_kwargs": {"net_arch": {"pi": [64], "qf": [64.0]}}}, r"qf is \[64\.0\], expected the hidden units"),
