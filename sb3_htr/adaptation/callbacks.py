@@ -21,7 +21,7 @@ from sb3_htr.common.atomic import atomic_path
 from sb3_htr.common.checks import check_is_env, get_task_family
 from sb3_htr.common.digest import is_whole_zip
 from sb3_htr.common.errors import training_goes_on
-from sb3_htr.common.settings import check_numbers
+from sb3_htr.common.settings import LOWEST, check_numbers
 from sb3_htr.common.vec_env import N_ENVS, make_task_vec_env
 
 
@@ -60,6 +60,9 @@ class MetaEvalCallback(EvalCallback):
             eval_env = make_task_vec_env(eval_env, N_ENVS)
         check_is_env(eval_env)
         super().__init__(eval_env, n_eval_episodes=n_eval_episodes, **kwargs)
+        check_numbers(eval_freq=(self.eval_freq, LOWEST))
+        if self.eval_freq % 1:  # as of a division: few numbers of calls, or none, are a multiple of it
+            raise ValueError(f"eval_freq is {self.eval_freq}, expected a whole number of calls: round it.")
         self.tasks = task_set(get_task_family(self.eval_env), tasks)
         if explorer is not None:
             to_explorer(explorer)  # says now what is wrong with it

@@ -121,6 +121,13 @@ def test_the_last_evaluation_is_written_at_the_end_if_it_could_not_be_before(
     assert len(np.load(tmp_path / "evaluations.npz")["timesteps"]) == len(callback.returns) == 2
 
 
+@pytest.mark.parametrize("eval_freq", [10_000 / 12, float("nan"), None, "100"])
+def test_evaluations_that_would_not_be_due_are_refused_before_the_training(eval_freq: Any) -> None:
+    with pytest.raises(ValueError, match=r"eval_freq is .*, expected a "):
+        MetaEvalCallback(ENV_ID, eval_freq=eval_freq)
+    assert MetaEvalCallback(ENV_ID, eval_freq=10_000 / 20).eval_freq == 500
+
+
 def test_an_evaluation_without_episodes_is_refused_before_the_training() -> None:
     with pytest.raises(ValueError, match="n_eval_episodes is 0, expected a whole number of at least 1"):
         MetaEvalCallback(ENV_ID, n_eval_episodes=0)
