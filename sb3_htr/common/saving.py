@@ -4,6 +4,7 @@ import io
 import pathlib
 import sys
 import warnings
+import zipfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, ClassVar, TypeVar
@@ -65,6 +66,19 @@ def _beside(folder: pathlib.Path) -> pathlib.Path:
     return path
 
 
+def _check_is_no_file_of_torch(path: pathlib.Path) -> None:
+    """Which is a zip file too. Of one without settings, SB3 does not say what it is."""
+    file = path if path.exists() else with_suffix(path, ".zip")
+    if not zipfile.is_zipfile(file):
+        return
+    with zipfile.ZipFile(file) as archive:
+        if "data" not in archive.namelist():
+            raise ValueError(
+                f"{path} is no model: an agent that is adapted to a task is loaded by AdaptedAgent.load, and a replay buffer "
+                "by the load_replay_buffer of a model."
+            )
+
+
 class CheckedFiles(BaseAlgorithm):
     """An algorithm whose ``save`` is atomic, and whose ``load`` takes neither files of others nor settings that it lacks."""
 
@@ -118,10 +132,10 @@ class CheckedFiles(BaseAlgorithm):
         check_mappings(**{name: value for name, value in kwargs.items() if name.endswith("_kwargs")})
         if "stats_window_size" in kwargs:  # has another name in SB3's models
             kwargs["_stats_window_size"] = kwargs.pop("stats_window_size")
-        if str(path).endswith(".pt"):
-            raise ValueError(f"{path} is no model: an agent that is adapted to a task is loaded by AdaptedAgent.load.")
-        if not isinstance(path, io.IOBase) and pathlib.Path(path).is_dir():
-            path = _beside(pathlib.Path(path))
+        if not isinstance(path, io.IOBase):
+            if pathlib.Path(path).is_dir():
+                path = _beside(pathlib.Path(path))
+            _check_is_no_file_of_torch(pathlib.Path(path))
         if {"ent_coef", "replay_buffer_kwargs"} & kwargs.keys():
             theirs = cls._settings(path, custom_objects)
             if "ent_coef" in kwargs and isinstance(kwargs["ent_coef"], str) != isinstance(theirs.get("ent_coef"), str):

@@ -557,6 +557,20 @@ def test_a_folder_of_a_models_name_is_not_in_its_way(tiny_pearl: MakePEARL, tmp_
         PEARL.load(tmp_path)
 
 
+@pytest.mark.filterwarnings("ignore:No reward was found")
+def test_a_model_is_told_by_what_is_in_its_file(tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    """Its name may end as files of torch do, and theirs as a model's."""
+    model = tiny_pearl()
+    model.save(tmp_path / "model.pt")
+    assert PEARL.load(tmp_path / "model.pt").seed == 0
+    model.save_replay_buffer(tmp_path / "replay")
+    for name in ("agent.pt", "agent.zip"):
+        model.adapt(ENV_ID, n_episodes=1, task=0).save(tmp_path / name)
+    for name in ("agent.pt", "agent", "replay.pt"):
+        with pytest.raises(ValueError, match=r"is no model: an agent .* is loaded by AdaptedAgent\.load, and a replay"):
+            PEARL.load(tmp_path / name)
+
+
 def test_a_setting_that_cannot_be_read_is_not_the_default(
     tmp_path: Path, tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch
 ) -> None:
