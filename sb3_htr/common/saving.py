@@ -170,6 +170,7 @@ class CheckedFiles(BaseAlgorithm):
     def _setup_model(self) -> None:
         # Not in the constructor, as it can be given to load, too; of 0, logs would lack what they are to have
         check_numbers(stats_window_size=(self._stats_window_size, 1))
+        self._stats_window_size = int(self._stats_window_size)  # no number of numpy, which a deque does not take
         self._check_policy_class()
         super()._setup_model()  # type: ignore[safe-super]
 

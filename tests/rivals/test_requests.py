@@ -105,6 +105,12 @@ def test_settings_of_one(kind: Any, settings: dict[str, Any], message: str) -> N
         kind(kind.DEFAULT_POLICY, ENV_ID, **settings)
 
 
+@RIVALS
+def test_a_window_may_be_a_number_of_numpy(kind: Any) -> None:
+    model = small(kind, stats_window_size=np.int64(3)).learn(40)
+    assert model.ep_info_buffer.maxlen == 3
+
+
 def test_an_entropy_coefficient_may_be_learnt() -> None:
     model = small(SACHER, ent_coef="auto_0.1", target_entropy="auto")
     assert model.target_entropy == -2 and model.log_ent_coef.exp().item() == pytest.approx(0.1)
