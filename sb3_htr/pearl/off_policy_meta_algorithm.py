@@ -112,7 +112,7 @@ class OffPolicyMetaAlgorithm(MetaTest, ReplayFiles, CheckedFiles, SAC):
         if not isinstance(policy, str | type):  # a class of another kind is refused by CheckedFiles
             check_class("policy", policy, PEARLPolicy)
         seed = checked_seed(seed)
-        self.explorer, self.train_explorer = to_explorer(explorer), to_explorer(train_explorer)
+        self.explorer, self.train_explorer = to_explorer(explorer), to_explorer(train_explorer, "train_explorer")
         if isinstance(env, str):
             env = make_task_vec_env(env, n_tasks_per_rollout, seed=seed)
         if env is not None:
@@ -152,7 +152,8 @@ class OffPolicyMetaAlgorithm(MetaTest, ReplayFiles, CheckedFiles, SAC):
         self._check_policy_class()
         # Not in the constructor: settings can be given to load() too, in place of those of the file
         self._complete_settings()
-        self.explorer, self.train_explorer = to_explorer(self.explorer), to_explorer(self.train_explorer)
+        self.explorer = to_explorer(self.explorer)
+        self.train_explorer = to_explorer(self.train_explorer, "train_explorer")
         if self.env is None:
             # Loaded for prediction only: SB3 wants a buffer, we want no memory of it
             self.replay_buffer = ReplayBuffer(1, self.observation_space, self.action_space)  # type: ignore[assignment]

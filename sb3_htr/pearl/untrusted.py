@@ -141,7 +141,7 @@ def check_loadable(hyperparams: dict[str, Any], model_class: type[PEARL] = PEARL
     _check_memory(hyperparams)
     for name in EXPLORERS:
         if name in hyperparams:
-            _check_explorer(name, str(type(explorers.to_explorer(hyperparams[name]))))
+            _check_explorer(name, str(type(explorers.to_explorer(hyperparams[name], name))))
 
 
 def _check_weights(model_class: type[PEARL]) -> None:

@@ -21,14 +21,15 @@ def register_explorer(kind: type[SelfExplorer]) -> type[SelfExplorer]:
     return register("explorer", kind, Explorer, EXPLORERS, str.lower)
 
 
-def to_explorer(explorer: object) -> Explorer:
+def to_explorer(explorer: object, setting: str = "explorer") -> Explorer:
     """
     :param explorer: an :class:`Explorer`, its name, or its name and settings, such as
         ``{"name": "prior", "n_exploration_episodes": 9}``
+    :param setting: that chooses it, for messages
     :return: an explorer with these settings
     :raises ValueError: for an unknown name or setting, or an object of a class that has the name of another one
     """
-    made = make("explorer", explorer, EXPLORERS, Explorer)
+    made = make(setting, explorer, EXPLORERS, Explorer)
     check_own_name("explorer", type(made), EXPLORERS.get(made.name, type(made)), made.name)
     return made
 
