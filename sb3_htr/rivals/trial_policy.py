@@ -59,7 +59,8 @@ class TrialLstmPolicy(RecurrentActorCriticPolicy):
     :param normalize_observations: both see the env's observations less their running mean in training, divided by the standard
         deviation, as PEARL's networks do by default; here not by default, as in the library
     :param kwargs: of the library's policy
-    :raises ValueError: if normalize_observations is no bool, or there is another features extractor beside it
+    :raises ValueError: if normalize_observations is no bool, or there is another features extractor beside it; for layers of
+        networks that it has not
     """
 
     def __init__(
@@ -72,6 +73,10 @@ class TrialLstmPolicy(RecurrentActorCriticPolicy):
         **kwargs: Any,
     ) -> None:
         check_flags(normalize_observations=normalize_observations)
+        layers = kwargs.get("net_arch")
+        # The library ignores them, and where "vf" is missing, the critic has no layers
+        if isinstance(layers, dict) and not layers.keys() <= {"pi", "vf"}:
+            raise ValueError(f"net_arch is {layers}, expected layers for 'pi' and 'vf', or a list for both.")
         self.normalize_observations = normalize_observations
         if normalize_observations:
             if (given := kwargs.get("features_extractor_class", TrialFeatures)) not in (TrialFeatures, FlattenExtractor):

@@ -93,6 +93,7 @@ def test_settings_that_load_is_given(kind: Any, settings: dict[str, Any], messag
         (RL2, {"target_kl": "x"}, "target_kl is 'x', expected a number"),
         (RL2, {"ent_coef": "auto"}, "ent_coef is 'auto', expected a number"),
         (RL2, {"policy_kwargs": {"lstm_hidden_size": -1}}, "lstm_hidden_size is -1, expected a whole number of at least 1"),
+        (RL2, {"policy_kwargs": {"net_arch": {"pi": [8], "qf": [8]}}}, "net_arch is .*, expected layers for 'pi' and 'vf'"),
         (RL2, {"policy_kwargs": {"n_lstm_layers": 0}}, "n_lstm_layers is 0, expected a whole number of at least 1"),
         (SACHER, {"policy_kwargs": {"n_critics": 0}}, "n_critics is 0, expected a whole number of at least 1"),
         (SACHER, {"ent_coef": "1e-3"}, "ent_coef is the text '1e-3', expected a number"),
