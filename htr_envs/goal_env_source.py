@@ -276,18 +276,27 @@ def draw_goal(source: GoalEnvSource, seed: int) -> FloatArray:
 
 
 def _failure_reward(source: GoalEnvSource, goals: FloatArray) -> float:
-    others = np.roll(goals, 1, axis=0)
-    found = np.unique(np.stack([goal_rewards(source, goals + np.float32(t) * (others - goals), goals) for t in WAY]))
-    success = np.unique(goal_rewards(source, goals, goals))
-    if len(np.union1d(found, success)) == 1:
+    ways = np.roll(goals, 1, axis=0) - goals
+
+    def ask() -> FloatArray:
+        return np.stack([goal_rewards(source, goals + np.float32(t) * ways, goals) for t in (0.0, *WAY)])
+
+    told = ask()
+    success, found = np.unique(told[0]), np.unique(told)
+    if len(found) == 1:
         raise ValueError(
             f"compute_reward of {source.spec.id} gives {success[0]:.3g} at each goal for each other one: the goals that it "
             "draws lie so near to one another that all are reached at once, or its reward tells of no goal."
         )
-    if len(success) != 1 or not np.array_equal(np.union1d(found, success), success[0] - np.array([1.0, 0.0])):
-        shown = ", ".join(f"{value:.3g}" for value in np.union1d(found, success)[:5])
+    if len(success) != 1 or not np.array_equal(found, success[0] - np.array([1.0, 0.0])):
+        shown = ", ".join(f"{value:.3g}" for value in found[:5])
         raise ValueError(f"compute_reward of {source.spec.id} gives {shown} ..., {SPARSE_ONLY}")
     _check_steps(source)
+    if not np.array_equal(ask(), told):
+        raise ValueError(
+            f"compute_reward of {source.spec.id} gives other rewards for the same goals after {N_STEPS} steps: a reward must "
+            "depend on achieved and desired goal alone. What else it needs, such as a speed or a contact, belongs into both."
+        )
     return float(success[0]) - 1.0
 
 

@@ -107,6 +107,20 @@ class InformedEnv(ReachEnv):
         return np.array([one["reward"] for one in info])
 
 
+class SlowEnv(ReachEnv):
+    """Its goals are reached where its latest action was small, of which goals tell nothing."""
+
+    effort = 0.0
+
+    def step(self, action: Any) -> Any:
+        self.effort = float(np.abs(action).max())
+        return super().step(action)
+
+    def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+        rewards = super().compute_reward(achieved_goal, desired_goal, info)
+        return rewards if self.effort < 0.1 else np.full_like(rewards, -1.0)
+
+
 class UnseededEnv(ReachEnv):
     """Its goals are drawn from numpy's global generator."""
 
@@ -212,7 +226,7 @@ class Robot(ReachEnv):
         return self._observe(), {}
 
 
-BAD = (MovingEnv, CostlyEnv, InformedEnv, UnseededEnv, PlainEnv, DiscreteEnv, OldEnv, UnseededOldEnv, OldStepEnv)
+BAD = (MovingEnv, CostlyEnv, SlowEnv, InformedEnv, UnseededEnv, PlainEnv, DiscreteEnv, OldEnv, UnseededOldEnv, OldStepEnv)
 _class: Any
 for _class in (ReachEnv, ChoiceEnv, ListEnv, CutEnv, ExactEnv, *BAD):
     gym.register(f"Toy{_class.__name__}-v0", entry_point=_class, max_episode_steps=30)
@@ -403,6 +417,7 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     ("ToyUnseededEnv-v0", {}, "draws another goal for the same seed"),
     ("ToyMovingEnv-v0", {}, "has a goal that moves within an episode"),
     ("ToyCostlyEnv-v0", {}, "must depend on achieved and desired goal alone"),
+    ("ToySlowEnv-v0", {}, "gives other rewards for the same goals after 20 steps: a reward must depend on"),
     ("ToyInformedEnv-v0", {}, "raised KeyError('reward') for goals of shape (n, goal_dim)"),
     ("ToyPlainEnv-v0", {}, "ToyPlainEnv-v0 is no GoalEnv"),
     ("ToyDiscreteEnv-v0", {}, "expected a one-dimensional Box"),
