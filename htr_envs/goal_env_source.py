@@ -193,11 +193,11 @@ def goal_rewards(source: GoalEnvSource, achieved_goals: ArrayLike, goals: ArrayL
     """
     env = probe(source)
     assert isinstance(env.observation_space, spaces.Dict)
-    # float32 as in observations; then rows in one piece, whatever the leading axes: sums may be ordered by memory layout, and
-    # rewards must be the same bits
+    # float32 as in observations; then copies, which the env may write into, of rows in one piece, whatever the leading axes:
+    # sums may be ordered by memory layout, and rewards must be the same bits
     both = np.broadcast_arrays(*(np.asarray(values, dtype=np.float32) for values in (achieved_goals, goals)))
     achieved, desired = (
-        np.ascontiguousarray(values.reshape(-1, values.shape[-1]), dtype=env.observation_space[key].dtype)
+        np.array(values.reshape(-1, values.shape[-1]), dtype=env.observation_space[key].dtype, order="C")
         for values, key in zip(both, GOAL_KEYS[1:], strict=True)
     )
     try:

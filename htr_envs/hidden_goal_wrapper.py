@@ -46,8 +46,9 @@ class HiddenGoalWrapper(gym.Wrapper[Any, Any, Any, Any]):
             self._goal = np.array(observation["desired_goal"])
             if not np.isfinite(self._goal).all():
                 raise ValueError(f"The desired_goal of {self._name} is {self._goal}, expected finite numbers.")
-            # One goal at a time, as a robot need not take many
-            self._success = float(self.env.get_wrapper_attr("compute_reward")(self._goal, self._goal, {}))
+            # One goal at a time, as a robot need not take many; copies, which it may write into
+            compute_reward = self.env.get_wrapper_attr("compute_reward")
+            self._success = float(compute_reward(self._goal.copy(), self._goal.copy(), {}))
             self._check_sparse(self._success)
         self._check_goal(observation)
         return without_goal(observation), info

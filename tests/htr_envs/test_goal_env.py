@@ -121,6 +121,27 @@ class SlowEnv(ReachEnv):
         return rewards if self.effort < 0.1 else np.full_like(rewards, -1.0)
 
 
+class InPlaceEnv(ReachEnv):
+    """Its compute_reward writes into the goals that it is given, which have the dtype of what is stored."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        plane = spaces.Box(-9.0, 9.0, (2,), np.float32)
+        self.observation_space = spaces.Dict(observation=plane, achieved_goal=plane, desired_goal=plane)
+
+    def _observe(self) -> dict[str, Any]:
+        return {key: value.astype(np.float32) for key, value in super()._observe().items()}
+
+    def step(self, action: Any) -> Any:
+        self.position = np.clip(self.position + 0.1 * action, -9.0, 9.0)
+        reward = float(self.compute_reward(self.position.copy(), self.goal, {}))
+        return self._observe(), reward, False, False, {}
+
+    def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+        achieved_goal -= desired_goal
+        return super().compute_reward(achieved_goal, 0.0, info)
+
+
 class UnseededEnv(ReachEnv):
     """Its goals are drawn from numpy's global generator."""
 
@@ -226,9 +247,13 @@ class Robot(ReachEnv):
         return self._observe(), {}
 
 
+class InPlaceRobot(Robot, InPlaceEnv):
+    """The same, whose compute_reward writes into its arguments."""
+
+
 BAD = (MovingEnv, CostlyEnv, SlowEnv, InformedEnv, UnseededEnv, PlainEnv, DiscreteEnv, OldEnv, UnseededOldEnv, OldStepEnv)
 _class: Any
-for _class in (ReachEnv, ChoiceEnv, ListEnv, CutEnv, ExactEnv, *BAD):
+for _class in (ReachEnv, ChoiceEnv, ListEnv, CutEnv, ExactEnv, InPlaceEnv, *BAD):
     gym.register(f"Toy{_class.__name__}-v0", entry_point=_class, max_episode_steps=30)
 TOY, CHOICE = "ToyReachEnv-v0", "ToyChoiceEnv-v0"
 
@@ -360,6 +385,17 @@ def test_an_episode_that_the_goal_env_cuts_short_is_truncated() -> None:
     while not any(ends[-1]):
         ends.append(env.step(np.array([1.0, 0.0], dtype=np.float32))[2:4])
     assert len(ends) < 30 and ends[-1] == (False, True)
+
+
+def test_a_compute_reward_may_write_into_its_arguments() -> None:
+    env = gym.make(hide_goal("ToyInPlaceEnv-v0"))
+    check_task_env(env)
+    start = env.reset(seed=0)[0]
+    observations, rewards = play(env, 0 * actions_of(env, 3), seed=0, options={"task": start[-2:] + np.float32(0.1)})
+    assert np.array_equal(observations, [start] * 4) and rewards.tolist() == [1.0, 1.0, 1.0]
+    robot = HiddenGoalWrapper(InPlaceRobot())
+    robot.reset()
+    assert robot.step(np.zeros(2, dtype=np.float32))[1] == 0.0
 
 
 def test_task_sets_follow_the_task_seed_alone() -> None:
