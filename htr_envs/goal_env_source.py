@@ -142,14 +142,20 @@ def check_goal_env(env: gym.Env[Any, Any], name: str) -> None:
 
     :param env: the env.
     :param name: of it, for the sentence.
-    :raises ValueError: if it has not.
+    :raises ValueError: if it has not, or goals of two shapes.
     """
-    space = env.observation_space
+    space: Any = env.observation_space
     boxes = [space.spaces.get(key) for key in GOAL_KEYS] if isinstance(space, spaces.Dict) else [None]
     if not all(map(_is_flat, boxes)) or not env.has_wrapper_attr("compute_reward"):
         raise ValueError(
             f"{name} is no GoalEnv: its observations must be a Dict of one-dimensional boxes observation, "
             "achieved_goal and desired_goal, and it must have compute_reward(achieved_goal, desired_goal, info)."
+        )
+    achieved, desired = (space[key].shape for key in GOAL_KEYS[1:])
+    if achieved != desired:
+        raise ValueError(
+            f"{name} achieves goals of shape {achieved} and desires goals of {desired}, expected the same, as each that is "
+            "achieved may become one that is desired: leave out of achieved_goal what no goal asks for."
         )
 
 

@@ -200,6 +200,20 @@ class PlainEnv(ReachEnv):
         self.observation_space = spaces.Box(-1.0, 1.0, (2,))
 
 
+class HeightEnv(ReachEnv):
+    """Its goals are a part of what is achieved."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_space = spaces.Dict({**self.observation_space, "desired_goal": spaces.Box(-9.0, 9.0, (1,))})
+
+    def _observe(self) -> dict[str, Any]:
+        return {**super()._observe(), "desired_goal": self.goal[:1]}
+
+    def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+        return super().compute_reward(achieved_goal[..., :1], desired_goal[..., :1], info)
+
+
 class DiscreteEnv(ReachEnv):
     """Its actions are no vectors."""
 
@@ -251,7 +265,19 @@ class InPlaceRobot(Robot, InPlaceEnv):
     """The same, whose compute_reward writes into its arguments."""
 
 
-BAD = (MovingEnv, CostlyEnv, SlowEnv, InformedEnv, UnseededEnv, PlainEnv, DiscreteEnv, OldEnv, UnseededOldEnv, OldStepEnv)
+BAD = (
+    MovingEnv,
+    CostlyEnv,
+    SlowEnv,
+    InformedEnv,
+    UnseededEnv,
+    PlainEnv,
+    HeightEnv,
+    DiscreteEnv,
+    OldEnv,
+    UnseededOldEnv,
+    OldStepEnv,
+)
 _class: Any
 for _class in (ReachEnv, ChoiceEnv, ListEnv, CutEnv, ExactEnv, InPlaceEnv, *BAD):
     gym.register(f"Toy{_class.__name__}-v0", entry_point=_class, max_episode_steps=30)
@@ -456,6 +482,7 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     ("ToySlowEnv-v0", {}, "gives other rewards for the same goals after 20 steps: a reward must depend on"),
     ("ToyInformedEnv-v0", {}, "raised KeyError('reward') for goals of shape (n, goal_dim)"),
     ("ToyPlainEnv-v0", {}, "ToyPlainEnv-v0 is no GoalEnv"),
+    ("ToyHeightEnv-v0", {}, "ToyHeightEnv-v0 achieves goals of shape (2,) and desires goals of (1,), expected the same"),
     ("ToyDiscreteEnv-v0", {}, "expected a one-dimensional Box"),
     ("ToyOldEnv-v0", {}, "ToyOldEnv-v0 has the interface of the old gym: reset must take seed and options"),
     ("ToyUnseededOldEnv-v0", {}, "ToyUnseededOldEnv-v0 has the interface of the old gym"),
