@@ -222,7 +222,13 @@ class HiddenGoalEnv(TaskEnv):
             self._follow(self._env, NOT_BEGUN)
         # by bounds of the GoalEnv's own dtype: those of our space, rounded to float32, may lie outside of them
         self._actions.append(np.clip(action, *self._bounds))
-        observation, _, terminated, self._truncated, _ = self._env.step(self._actions[-1].copy())
+        observation, paid, terminated, self._truncated, _ = self._env.step(self._actions[-1].copy())
+        failure = self.task_family.failure_reward
+        if paid not in (failure, failure + 1.0):
+            raise ValueError(
+                f"A step of {self.task_family.source.spec.id} gave the reward {float(paid):.3g}, but compute_reward gives "
+                f"{failure:.3g} or {failure + 1.0:.3g}: a reward must depend on achieved and desired goal alone."
+            )
         own_end = terminated and self.task_family.reached(observation["achieved_goal"], observation["desired_goal"])
         return without_goal(observation), 0.0, bool(terminated and not own_end)
 

@@ -107,6 +107,14 @@ class InformedEnv(ReachEnv):
         return np.array([one["reward"] for one in info])
 
 
+class FragileEnv(ReachEnv):
+    """Far away it pays for what breaks, which 20 steps do not see."""
+
+    def step(self, action: Any) -> Any:
+        observation, reward, *rest = super().step(action)
+        return observation, reward - 5.0 * (abs(self.position[0]) > 3), *rest
+
+
 class SlowEnv(ReachEnv):
     """Its goals are reached where its latest action was small, of which goals tell nothing."""
 
@@ -279,7 +287,7 @@ BAD = (
     OldStepEnv,
 )
 _class: Any
-for _class in (ReachEnv, ChoiceEnv, ListEnv, CutEnv, ExactEnv, InPlaceEnv, *BAD):
+for _class in (ReachEnv, ChoiceEnv, ListEnv, CutEnv, ExactEnv, InPlaceEnv, FragileEnv, *BAD):
     gym.register(f"Toy{_class.__name__}-v0", entry_point=_class, max_episode_steps=30)
 TOY, CHOICE = "ToyReachEnv-v0", "ToyChoiceEnv-v0"
 
@@ -411,6 +419,13 @@ def test_an_episode_that_the_goal_env_cuts_short_is_truncated() -> None:
     while not any(ends[-1]):
         ends.append(env.step(np.array([1.0, 0.0], dtype=np.float32))[2:4])
     assert len(ends) < 30 and ends[-1] == (False, True)
+
+
+def test_a_reward_that_no_goal_tells_of_is_named_when_it_is_paid() -> None:
+    """Each other agent would be told of it, and the hidden goal's would never."""
+    env = HiddenGoalEnv("ToyFragileEnv-v0")
+    with pytest.raises(ValueError, match=r"A step of ToyFragileEnv-v0 gave the reward -6, but .* must depend on achieved and"):
+        play(env, np.ones((50, 2), dtype=np.float32), seed=0)
 
 
 def test_a_compute_reward_may_write_into_its_arguments() -> None:
