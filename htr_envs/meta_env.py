@@ -318,7 +318,7 @@ class MetaEnv(HasTaskFamily, gym.Env[FloatArray, FloatArray], ABC):
         if self._last_observation is None:
             raise ResetNeeded("step was called before the first reset: call env.reset() first.")
         action = checked_action(action, self.action_space)
-        stepped = self._step_state(action)
+        stepped = self._step_state(action.copy())  # which may be written into; rewards are of what was given
         if not isinstance(stepped, tuple | list) or len(stepped) != 3:
             got = f"{len(stepped)} values" if isinstance(stepped, tuple | list) else f"a {type(stepped).__name__}"
             raise ValueError(

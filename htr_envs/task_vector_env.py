@@ -173,7 +173,7 @@ class TaskVectorEnv(HasRewardHooks, VectorEnv[FloatArray, FloatArray, NDArray[An
         if self._last_observations is None:
             raise ResetNeeded("step was called before the first reset: call reset() first.")
         actions = checked_action(actions, self.action_space)
-        stepped = self._step_state(actions)
+        stepped = self._step_state(actions.copy())  # as in a single env
         given = tuple(map(np.shape, stepped)) if isinstance(stepped, tuple | list) else f"a {type(stepped).__name__}"
         expected = (self._last_observations.shape, (self.num_envs,), (self.num_envs,))
         if given != expected:

@@ -233,6 +233,30 @@ def test_dynamics_written_once_are_a_single_and_a_batched_env() -> None:
         env.close()
 
 
+class Writing(Walkers):
+    """Writes into the actions that it is given."""
+
+    def step(self, actions: Any) -> Any:
+        actions *= 0.1
+        return super().step(actions)
+
+
+class PaysForEffort(LineFamily):
+    """In each step, so that it is seen."""
+
+    def compute_reward(self, traj: Any, task: Any, reward_type: str = "sparse") -> Any:
+        return traj.actions[..., 0].copy()
+
+
+def test_rewards_are_of_what_the_agent_did_whatever_dynamics_make_of_it() -> None:
+    """Which is what a replay buffer has."""
+    single, vector = DynamicsEnv(PaysForEffort(), Writing(1)), DynamicsVectorEnv(PaysForEffort(), Writing(3))
+    single.reset(seed=0)
+    vector.reset(seed=0)
+    assert single.step(np.array([0.5], dtype=np.float32))[1] == 0.5
+    assert vector.step(np.full((3, 1), 0.5, dtype=np.float32))[1].tolist() == [0.5, 0.5, 0.5]
+
+
 def test_dynamics_that_do_not_fit_are_refused() -> None:
     with pytest.raises(ValueError, match="num_envs is 0"):
         Walkers(0)
