@@ -9,6 +9,7 @@ task, long after the environment has moved on: the family is a small object that
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -126,15 +127,26 @@ class TaskFamily(TaskDistribution):
         """
 
 
-def told_by_hook(name: str, values: Any, expected: tuple[int, ...]) -> Any:
-    """Pass on what a reward hook returned for trajectories of one step.
+def ask_hook(hook: Callable[..., Any], name: str, expected: tuple[int, ...], traj: Trajectory, *args: Any) -> Any:
+    """What a reward hook returns for trajectories of one step.
 
+    :param hook: of the task family.
     :param name: of the hook.
-    :param values: what it returned.
-    :param expected: shape that they should have.
-    :return: the values.
-    :raises ValueError: if they have another one, of which rewards or tasks would go wrong later, far from the hook.
+    :param expected: shape of what it should return.
+    :param traj: read-only, as the next hook is told of the same.
+    :param args: what else the hook is given.
+    :return: what it returned.
+    :raises ValueError: if that has another shape, of which rewards or tasks would go wrong later, far from the hook, or if it
+        writes into what it is given.
     """
+    try:
+        values = hook(traj, *args)
+    except ValueError as error:
+        if "read-only" not in str(error):
+            raise
+        raise ValueError(
+            f"{name} of the task family writes into the trajectory or task that it is given: let it make new arrays."
+        ) from error
     if not isinstance(values, np.ndarray | np.generic) or values.shape != expected:
         what = f"shape {values.shape}" if isinstance(values, np.ndarray | np.generic) else f"a {type(values).__name__}"
         kind = "one task for each trajectory" if name == "hindsight_task" else "one value for each step"
@@ -143,6 +155,15 @@ def told_by_hook(name: str, values: Any, expected: tuple[int, ...]) -> Any:
             f"{expected}: {kind}."
         )
     return values
+
+
+def read_only(*arrays: NDArray[Any]) -> None:
+    """Have hooks compute new arrays.
+
+    :param arrays: which nobody is to write into.
+    """
+    for array in arrays:
+        array.setflags(write=False)
 
 
 class HasRewardHooks(HasTaskFamily):
@@ -212,11 +233,13 @@ class TaskEnv(HasRewardHooks, MetaEnv):
         assert before is not None and after is not None
         # one reward function for step and for relabelling: compute_reward gives step's rewards again, bit for bit
         traj = Trajectory(before[None], action[None], after[None], np.array([task_free_reward], np.float32))
-        reward = told_by_hook("compute_reward", self.compute_reward(traj, self.task), (1,))
+        task = self.task
+        read_only(*traj, task)
+        reward = ask_hook(self.compute_reward, "compute_reward", (1,), traj, task)
         info = {
             "task_id": self.task_id,
-            "is_success": bool(told_by_hook("is_success", self.task_family.is_success(traj, self.task), (1,))[0]),
-            "achieved_task": told_by_hook("hindsight_task", self.hindsight_task(traj, 0), self.task.shape),
+            "is_success": bool(ask_hook(self.task_family.is_success, "is_success", (1,), traj, task)[0]),
+            "achieved_task": ask_hook(self.hindsight_task, "hindsight_task", task.shape, traj, 0),
             "task_free_reward": float(traj.task_free_reward[0]),
         }
         return observation, float(reward[0]), bool(terminated), False, info

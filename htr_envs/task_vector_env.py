@@ -13,7 +13,16 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from htr_envs.meta_env import check_seed, checked_action, task_from_options
-from htr_envs.task_env import BoolArray, FloatArray, HasRewardHooks, TaskFamily, Trajectory, check_reward_type, told_by_hook
+from htr_envs.task_env import (
+    BoolArray,
+    FloatArray,
+    HasRewardHooks,
+    TaskFamily,
+    Trajectory,
+    ask_hook,
+    check_reward_type,
+    read_only,
+)
 
 
 class TaskVectorEnv(HasRewardHooks, VectorEnv[FloatArray, FloatArray, NDArray[Any]], ABC):
@@ -192,12 +201,11 @@ class TaskVectorEnv(HasRewardHooks, VectorEnv[FloatArray, FloatArray, NDArray[An
         final_obs = np.array(states, dtype=np.float32)
         # an axis of T = 1 makes every copy a trajectory of its own, with its own task
         traj = Trajectory(*(values[:, None] for values in (self._last_observations, actions, final_obs, task_free_reward)))
-        rewards = self.task_family.compute_reward(traj, self._tasks_of_episodes, self.reward_type)
-        rewards = told_by_hook("compute_reward", rewards, (self.num_envs, 1))[:, 0]
-        successes = told_by_hook("is_success", self.task_family.is_success(traj, self._tasks_of_episodes), (self.num_envs, 1))[
-            :, 0
-        ]
-        achieved = told_by_hook("hindsight_task", self.task_family.hindsight_task(traj, 0), self._tasks_of_episodes.shape)
+        family, tasks, shape = self.task_family, self.tasks, (self.num_envs, 1)
+        read_only(*traj, tasks)
+        rewards = ask_hook(family.compute_reward, "compute_reward", shape, traj, tasks, self.reward_type)[:, 0]
+        successes = ask_hook(family.is_success, "is_success", shape, traj, tasks)[:, 0]
+        achieved = ask_hook(family.hindsight_task, "hindsight_task", tasks.shape, traj, 0)
         self._elapsed_steps += 1
         truncated = np.zeros(self.num_envs, dtype=np.bool_)
         if self.max_episode_steps is not None:

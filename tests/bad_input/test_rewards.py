@@ -108,6 +108,28 @@ def test_a_reward_hook_of_another_shape_is_named_in_the_first_step(
         model.learn(ROLLOUT)
 
 
+def in_place_of(right: Any) -> Any:
+    def hook(family: Any, traj: Any, *args: Any) -> Any:
+        traj.next_observations[...] -= 1
+        return right(family, traj, *args)
+
+    return hook
+
+
+@pytest.mark.parametrize("hook", ["compute_reward", "is_success", "hindsight_task"])
+def test_a_reward_hook_that_writes_into_a_step_is_named_there(
+    hook: str, tiny_pearl: MakePEARL, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The next one would be told another step, and a wrapper be blamed."""
+    env = gym.make(ENV_ID)
+    env.reset(seed=0)
+    model = tiny_pearl(make_task_vec_env(ENV_ID, 4))
+    monkeypatch.setattr(PointRobotFamily, hook, in_place_of(getattr(PointRobotFamily, hook)))
+    for step in (lambda: env.step(env.action_space.sample()), lambda: model.learn(ROLLOUT)):
+        with pytest.raises(ValueError, match=f"{hook} of the task family writes into the trajectory or task that it is given"):
+            step()
+
+
 class WideBeyondTheEnv(PointRobotFamily):
     """What an env that asks its family for nothing would not notice."""
 

@@ -350,8 +350,26 @@ class RewardWithMemory(LineFamily):
 class RewardInPlace(LineFamily):
     def compute_reward(self, traj: Any, *args: Any) -> Any:
         rewards = super().compute_reward(traj, *args)
-        traj.actions[...] = 0.0
+        if len(traj.actions) > 1:
+            traj.actions[...] = 0.0
         return rewards
+
+
+@breaks("compute_reward of the task family writes into the trajectory or task that it is given: let it make new arrays")
+class RewardOnTop(LineFamily):
+    """Of the task-free one, which each step would have more of; only where the task is solved."""
+
+    def compute_reward(self, traj: Any, task: Any, reward_type: str = "sparse") -> Any:
+        rewards = traj.task_free_reward
+        rewards += self.is_success(traj, task)
+        return rewards
+
+
+@breaks("is_success of the task family writes into the trajectory or task that it is given: let it make new arrays")
+class DistanceInPlace(LineFamily):
+    def is_success(self, traj: Any, task: Any) -> Any:
+        task -= traj.next_observations[..., 0]
+        return np.abs(task) < 0.05
 
 
 @breaks("does not solve the task that hindsight_task named for it")
