@@ -44,7 +44,6 @@ def check_reward_hook(
     check_rewards_told(given, computed, task)
     _check_whole_episodes(family, columns, episodes[:MAX_WHOLE], computed, solved)
     _check_worth(family, columns, np.stack([episode[-1] for _, episode in episodes]))
-    _check_every_success(family, columns, episodes[:MAX_WHOLE])
     # What is more than rounding is a success to all that learns from it
     beside = np.maximum(*(np.abs(reward - traj.task_free_reward[:, 0]) for reward in (given, computed)))
     worthless = ~solved & (beside > ROUNDING)
@@ -55,6 +54,7 @@ def check_reward_hook(
             f"{computed[i]:.7g}, and its info['task_free_reward'] is {traj.task_free_reward[i, 0]:.7g}: they must be the "
             "same. compute_reward is what the task pays plus traj.task_free_reward."
         )
+    _check_reached(family, columns, episodes[:MAX_WHOLE])
     ended = rows[:, columns.done] > 0
     if is_relabelled and ended.any() and (ended == solved).all():
         warnings.warn(
@@ -124,15 +124,23 @@ def _check_whole_episodes(
                 )
 
 
-def _check_every_success(family: TaskFamily, columns: Transitions, episodes: Sequence[tuple[int, np.ndarray]]) -> None:
-    """Under a task that was reached, as few are solved of one's own at first: what success asks for, rewards must pay."""
+def _check_reached(family: TaskFamily, columns: Transitions, episodes: Sequence[tuple[int, np.ndarray]]) -> None:
+    """Under a task that was reached, as few are solved of one's own at first: rewards must pay for what success asks alone."""
     worth: list[np.ndarray] = []
     for _, episode in episodes:
         traj = columns.trajectory(episode[None])
         reached = family.hindsight_task(traj, len(episode) - 1)
         check_achieved(reached)
         solved = np.asarray(family.is_success(traj, reached))
-        worth.append(task_reward(family.compute_reward(traj, reached), traj.task_free_reward)[solved])
+        reward = family.compute_reward(traj, reached)
+        worth.append(task_reward(reward, traj.task_free_reward)[solved])
+        beside = (reward - traj.task_free_reward)[~solved]
+        if (wrong := np.abs(beside) > ROUNDING).any():
+            raise ValueError(
+                f"A step that does not solve a task which was reached, by is_success, is worth {beside[wrong][0]:.2g} beside "
+                "its task-free reward, by compute_reward, where failures are worth 0: pay for successes alone, or let "
+                "is_success ask for less."
+            )
     unpaid = np.concatenate(worth) <= 0
     if unpaid.mean() > UNPAID:
         raise ValueError(

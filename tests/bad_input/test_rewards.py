@@ -230,6 +230,21 @@ def test_successes_that_pay_nothing_are_named(
         tiny_pearl().learn(4 * ROLLOUT)
 
 
+class PaysAround(PointRobotFamily):
+    """Also beside the goal, where an untrained robot hardly ever is."""
+
+    def compute_reward(self, traj: Any, task: Any, reward_type: str = "sparse") -> Any:
+        around = self._distance(traj, task) < 2 * self.goal_radius
+        return np.maximum(super().compute_reward(traj, task, reward_type), np.float32(0.5) * around)
+
+
+def test_a_failure_that_pays_is_named_before_one_is_seen(tiny_pearl: MakePEARL) -> None:
+    """Hindsight tasks are reached from the first episode on."""
+    env = BatchedTaskVecEnv(DynamicsVectorEnv(PaysAround(goal_distance=9.0), PointRobotDynamics(4), max_episode_steps=20))
+    with pytest.raises(ValueError, match=r"does not solve a task which was reached, by is_success, is worth 0\.5 beside"):
+        tiny_pearl(env).learn(ROLLOUT)
+
+
 class WithoutSuccess(gym.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> Any:
         *result, info = self.env.step(action)
