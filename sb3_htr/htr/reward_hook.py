@@ -77,11 +77,16 @@ def check_returned_rewards(rewards: np.ndarray, expected: tuple[int, ...], when:
         raise ValueError(f"compute_reward{when} returned NaN or infinity, expected finite rewards.")
 
 
-def check_achieved(tasks: np.ndarray) -> None:
+def check_achieved(tasks: np.ndarray, expected: tuple[int, int] | None = None) -> None:
     """
     :param tasks: what ``hindsight_task`` returned
-    :raises ValueError: if it is not finite
+    :param expected: shape that they should have, of a task for each of several steps
+    :raises ValueError: if they have another, or are not finite
     """
+    if expected is not None and np.shape(tasks) != expected:
+        raise ValueError(
+            f"hindsight_task returned shape {np.shape(tasks)} for {expected[0]} steps, expected {expected}: a task for each."
+        )
     if not np.isfinite(tasks).all():
         raise ValueError("hindsight_task returned NaN or infinity for a step of finite numbers, expected a task.")
 
@@ -151,12 +156,8 @@ def _check_reached(family: TaskFamily, columns: Transitions, episodes: Sequence[
 
 def _check_worth(family: TaskFamily, columns: Transitions, last: np.ndarray) -> None:
     traj = columns.trajectory(last[:, None])
-    achieved, expected = family.hindsight_task(traj, 0), (len(last), family.train_tasks.shape[1])
-    if np.shape(achieved) != expected:
-        raise ValueError(
-            f"hindsight_task returned shape {np.shape(achieved)} for {len(last)} steps, expected {expected}: a task for each."
-        )
-    check_achieved(achieved)
+    achieved = family.hindsight_task(traj, 0)
+    check_achieved(achieved, (len(last), family.train_tasks.shape[1]))
     if not family.is_success(traj, achieved).all():
         raise ValueError(
             "hindsight_task names a task that its own step does not solve, by is_success: hindsight would teach what did "

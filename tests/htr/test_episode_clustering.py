@@ -57,6 +57,13 @@ def test_store_and_buffer_know_nothing_of_its_hindsight_tasks() -> None:
     assert stats["replay/n_hindsight_buffers"] == clustering.n_hindsight_buffers
 
 
+def test_a_hindsight_task_that_knows_one_step_alone_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Elsewhere it is asked for one step at a time."""
+    monkeypatch.setattr(type(FAMILY), "hindsight_task", lambda family, traj, index: traj.next_observations[..., -1, :2].copy())
+    with pytest.raises(ValueError, match=r"hindsight_task returned shape \(2,\) for \d+ steps, expected \(\d+, 2\)"):
+        filled()
+
+
 def test_real_rows_keep_their_rewards_and_hindsight_rows_have_those_of_one_cell() -> None:
     buffer, clustering = filled()
     data = buffer.sample(8, meta_batch_size=200, context_size=20)

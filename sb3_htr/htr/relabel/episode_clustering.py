@@ -10,6 +10,7 @@ from sb3_htr.common.type_aliases import Trajectory
 from sb3_htr.htr.relabel.base import HindsightDraw
 from sb3_htr.htr.relabel.hindsight_buffers import HindsightBuffers
 from sb3_htr.htr.relabel.hindsight_task import HindsightTaskStrategy, solved_at_start
+from sb3_htr.htr.reward_hook import check_achieved
 
 if TYPE_CHECKING:
     from sb3_htr.htr.multi_task_replay_buffer import MultiTaskReplayBuffer
@@ -103,6 +104,7 @@ class EpisodeClustering(HindsightBuffers):
         steps = strategy.steps(np.full(strategy.n_candidates, len(episode)), rng)
         traj = buffer.transitions.trajectory(episode)
         tasks = buffer.task_family.hindsight_task(traj, steps)
+        check_achieved(tasks, (len(steps), buffer.task_family.train_tasks.shape[1]))
         representatives = self.cells(tasks)
         count = np.array([[1 + self._n_episodes_of(representative) for representative in representatives]])
         is_solved = None
