@@ -325,8 +325,9 @@ class MetaEnv(HasTaskFamily, gym.Env[FloatArray, FloatArray], ABC):
                 f"_step_state must return an observation, a reward and whether the episode terminates, got {got}."
             )
         state, reward, terminated = stepped
-        if np.ndim(reward):
-            raise ValueError(f"_step_state returned a reward of shape {np.shape(reward)}, expected a number.")
+        if reward is None or np.ndim(reward):
+            what = "that is None" if reward is None else f"of shape {np.shape(reward)}"
+            raise ValueError(f"_step_state returned a reward {what}, expected a number.")
         if not isinstance(terminated, (bool, np.bool_)):
             raise ValueError(
                 f"_step_state returned {terminated!r} for whether the episode terminates, expected True or False: return an "

@@ -183,15 +183,16 @@ def test_a_reward_of_nan_at_the_goal_is_named(tiny_pearl: MakePEARL) -> None:
         tiny_pearl(env, n_tasks_per_rollout=1).learn(ROLLOUT)
 
 
-def test_a_reward_of_the_dynamics_that_is_no_number_is_named() -> None:
-    class Vector(LineEnv):
+@pytest.mark.parametrize(("given", "what"), [([0.1], r"of shape \(1,\)"), (None, "that is None")])
+def test_a_reward_of_the_dynamics_that_is_no_number_is_named(given: Any, what: str) -> None:
+    class OtherReward(LineEnv):
         def _step_state(self, action: Any) -> Any:
-            state, reward, terminated = super()._step_state(action)
-            return state, np.array([reward]), terminated
+            state, _, terminated = super()._step_state(action)
+            return state, given, terminated
 
-    env = Vector()
+    env = OtherReward()
     env.reset()
-    with pytest.raises(ValueError, match=r"_step_state returned a reward of shape \(1,\), expected a number"):
+    with pytest.raises(ValueError, match=f"_step_state returned a reward {what}, expected a number"):
         env.step(np.zeros(1, dtype=np.float32))
 
 
