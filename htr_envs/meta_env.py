@@ -287,7 +287,13 @@ class MetaEnv(HasTaskFamily, gym.Env[FloatArray, FloatArray], ABC):
                 "_reset_state returns an observation; _step_state an observation, a reward and whether the episode "
                 f"terminates. Expected an observation of shape {self.observation_space.shape}, got {given}."
             )
-        observation: FloatArray = np.array(state, dtype=self.observation_space.dtype)
+        dtype = self.observation_space.dtype
+        if dtype.kind != "f" and (given_dtype := np.asarray(state).dtype).kind == "f":
+            raise ValueError(
+                f"The observation is of dtype {given_dtype}, but the observation space of {dtype}, which would cut it: give "
+                "the env a Box of float32."
+            )
+        observation: FloatArray = np.array(state, dtype=dtype)
         self._last_observation = observation.astype(np.float32)
         return observation
 

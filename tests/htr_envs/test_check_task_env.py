@@ -84,6 +84,21 @@ def test_spaces_of_float64_are_fine() -> None:
     check_task_env(env)
 
 
+def test_an_observation_is_not_cut_to_whole_numbers() -> None:
+    class Ticks(LineEnv):
+        def __init__(self, unit: Any) -> None:
+            super().__init__()
+            self.observation_space = spaces.Box(-50, 50, (2,), np.int64)
+            self.unit = unit
+
+        def observe(self) -> Any:
+            return (super().observe() * 10).astype(self.unit)
+
+    assert Ticks(np.int32).reset()[0].dtype == np.int64
+    with pytest.raises(ValueError, match="observation is of dtype float32, but the observation space of int64"):
+        Ticks(np.float32).reset()
+
+
 # ---------------------------------------------------------------- tasks that may change anything
 
 
