@@ -417,6 +417,7 @@ def _check_id(env: gym.Env[Any, Any], family: TaskFamily, seed: int) -> None:
     spec.additional_wrappers = ()  # they change nothing that is looked at here
     spec.kwargs.pop("render_mode", None)  # nobody looks on, and batches have none
     twin = _call("The env cannot be made a second time by its id.", gym.make, spec)
+    _check_apart(env, twin, family, seed)
     twins: list[Any] = [twin.unwrapped]
     if spec.vector_entry_point is not None:
         mode = gym.VectorizeMode.VECTOR_ENTRY_POINT
@@ -429,6 +430,21 @@ def _check_id(env: gym.Env[Any, Any], family: TaskFamily, seed: int) -> None:
             told = f"Another env of the same id has other {name}: draw them with a generator whose seed is an argument."
             _require(_same(getattr(twin.task_family, name), getattr(family, name)), told)
         twin.close()
+
+
+def _check_apart(env: gym.Env[Any, Any], twin: gym.Env[Any, Any], family: TaskFamily, seed: int) -> None:
+    """Trainings have many in one process."""
+
+    def step_twin() -> None:
+        *_, terminated, truncated, _ = twin.step(twin.action_space.high)  # type: ignore[attr-defined]
+        if terminated or truncated:
+            twin.reset()
+
+    alone = _play(env, family, seed, 0)
+    twin.reset(seed=seed)
+    beside = _play(env, family, seed, 0, alone.traj.actions, step_twin)
+    apart = all(map(_same, alone.traj[:3], beside.traj[:3]))
+    _require(apart, "Envs of this id share a state: a step of one of them moves another. Make what moves in each constructor.")
 
 
 def _check_batch(batch: Any, env: gym.Env[Any, Any], family: TaskFamily, seed: int) -> None:

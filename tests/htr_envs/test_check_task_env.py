@@ -238,6 +238,14 @@ def test_an_id_whose_envs_have_other_tasks_each_time(monkeypatch: pytest.MonkeyP
     assert_refused(gym.make("Other-v0"), "Another env of the same id has other train_tasks")
 
 
+def test_an_id_whose_envs_move_one_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As those do that connect to one simulation."""
+    dynamics = PointRobotDynamics(1)
+    shared: Any = lambda: DynamicsEnv(PointRobotFamily(), dynamics)  # noqa: E731
+    monkeypatch.setattr(gym.registry["SparsePointRobot-v0"], "entry_point", shared)
+    assert_refused(gym.make("SparsePointRobot-v0"), "Envs of this id share a state: a step of one of them moves another")
+
+
 class TellsItsTask(CartEnv):
     def first(self) -> float:
         return float(self.task[0])
