@@ -245,9 +245,9 @@ ALL = (
         "What is left of adaptation without inference, with models of an ant.",
         ANT,
         600_000,
-        tuple(map(Variant, ("htr-ser", "pearl-dense"))),
+        (Variant("htr-ser"),),
         eval_freq=100_000,
-        evaluations=by(("training tasks in turn",)),
+        evaluations=by((*BELIEF, "training tasks in turn")),
         models_of="ant",
     ),
     Experiment(
