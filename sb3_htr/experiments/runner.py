@@ -28,7 +28,7 @@ from sb3_htr.zoo.run.agents import agent_at, file_stem, find_runs, is_finished
 from sb3_htr.zoo.run.algorithm import Model
 from sb3_htr.zoo.run.folder import SystemLock, run_number
 from sb3_htr.zoo.run.method import get_method, merged
-from sb3_htr.zoo.run.record import RECORD, read_record
+from sb3_htr.zoo.run.record import RECORD, read_record, records_in
 from sb3_htr.zoo.run.shipped import block_of
 from sb3_htr.zoo.run.train_arguments import training_facts
 from sb3_htr.zoo.run.trust import import_packages, plain_settings
@@ -158,7 +158,7 @@ def find_finished(cell: Cell, folder: Path) -> tuple[Path, Model] | None:
     :return: the run folder and its final model, None if there is no run, or none that is finished
     :raises ValueError: if a run in the folder is another one
     """
-    for run in find_runs(folder) if any(folder.rglob(RECORD)) else ():
+    for run in find_runs(folder) if any(records_in(folder)) else ():
         record = read_record(run / RECORD)
         has = {**training_facts(record["hyperparams"], record["arguments"]), **{key: record[key] for key in OF_RUN}}
         needs = _planned(cell)

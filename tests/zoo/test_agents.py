@@ -28,7 +28,7 @@ from sb3_htr.experiments.grid import Variant
 from sb3_htr.zoo import cli
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run import model_card
-from sb3_htr.zoo.run.agents import agent_at, agent_for
+from sb3_htr.zoo.run.agents import agent_at, agent_for, find_runs
 from sb3_htr.zoo.run.method import get_method
 from sb3_htr.zoo.run.record import RECORD, arguments_to_go_on, command_to_go_on, read_record
 from sb3_htr.zoo.run.shipped import hyperparams_file, shipped
@@ -70,6 +70,15 @@ def test_a_run_without_a_model_is_left_out(run: Path, tmp_path: Path, capsys: py
         agent_at(unfinished)
     assert agent_at(tmp_path / "logs").folder == run
     assert f"{unfinished} has no model yet, and is left out." in capsys.readouterr().err
+
+
+def test_runs_may_be_links_and_count_once(run: Path, tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+    other = make_run(tmp_path / "logs", tiny_pearl(), number=2)
+    chosen = tmp_path / "chosen"
+    chosen.mkdir()
+    for name, target in {"one": run, "another": other, "latest": other, "all": chosen}.items():
+        (chosen / name).symlink_to(target)
+    assert {path.resolve() for path in find_runs(chosen)} == {run, other} and len(find_runs(chosen)) == 2
 
 
 def test_the_newest_run_is_the_one_that_was_begun_last(tiny_pearl: MakePEARL, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from sb3_htr.zoo.plots.adaptation import plot_adaptation_curve, plot_adaptation_
 from sb3_htr.zoo.plots.curves import Curve, plot_curves
 from sb3_htr.zoo.plots.latent import plot_latent_space
 from sb3_htr.zoo.run.agents import TrainedAgent, runs_with_models
-from sb3_htr.zoo.run.record import RECORD
+from sb3_htr.zoo.run.record import records_in
 from sb3_htr.zoo.run.train_arguments import training_facts
 
 EXAMPLE = """  sb3-htr plot --env SparsePointRobot-v0                  an agent that comes with the package
@@ -119,7 +119,7 @@ def groups_of(parser: argparse.ArgumentParser, args: argparse.Namespace) -> dict
         raise ValueError(f"--labels needs one name of its own for each of the {len(args.agent)} folders, got {labels}.")
     groups: dict[str, list[TrainedAgent]] = {}
     for label, path in zip(labels, args.agent or [None], strict=True):
-        is_folder_of_runs = path is not None and path.is_dir() and any(path.rglob(RECORD))
+        is_folder_of_runs = path is not None and path.is_dir() and any(records_in(path))
         paths = runs_with_models(path) if is_folder_of_runs else [path]
         groups[label] = [chosen_agent(parser, args, path) for path in paths]
         check_same_settings(label, groups[label])

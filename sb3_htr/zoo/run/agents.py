@@ -26,7 +26,7 @@ from sb3_htr.common.vec_env import arguments_are_known, make_task_vec_env
 from sb3_htr.zoo.run.algorithm import Algorithm, Model
 from sb3_htr.zoo.run.folder import run_number
 from sb3_htr.zoo.run.method import DEFAULT, OWN, get_method, methods
-from sb3_htr.zoo.run.record import MAX_RECORD, RECORD, command_to_go_on, read_record
+from sb3_htr.zoo.run.record import MAX_RECORD, RECORD, command_to_go_on, read_record, records_in
 from sb3_htr.zoo.run.shipped import shipped
 from sb3_htr.zoo.run.trust import refuse
 
@@ -188,7 +188,7 @@ def find_runs(folder: Path) -> list[Path]:
     :return: run folders, the oldest first
     :raises FileNotFoundError: if there is none
     """
-    runs = sorted(folder.rglob(RECORD), key=_begun)
+    runs = sorted(records_in(folder), key=_begun)
     if not runs:
         raise FileNotFoundError(f"There is no run in {folder}: give the folder that `sb3-htr train` printed as 'Log path'.")
     return [run.parent for run in runs]
@@ -246,7 +246,7 @@ def agent_at(path: str | os.PathLike[str], which: str = "best", env_id: str | No
     """
     path = Path(path)
     files = list(path.glob("[!.]*.zip"))  # hidden ones are what a killed process left
-    if len(files) == 1 and not any(path.rglob(RECORD)):
+    if len(files) == 1 and not any(records_in(path)):
         path = files[0]
     if path.is_dir():
         run = runs_with_models(path)[-1]

@@ -2,8 +2,10 @@
 
 import json
 import math
+import os
 import shlex
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
@@ -44,6 +46,20 @@ def read_record(path: Path, content: bytes | None = None) -> dict[str, Any]:
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         pass
     raise ValueError(f"{path} is damaged, or no record of a run: it must say env_id, env_kwargs and gym_packages.")
+
+
+def records_in(folder: Path) -> Iterator[Path]:
+    """
+    :param folder: a run folder, or a folder with runs somewhere in it, or links to some
+    :return: their records, each once
+    """
+    known = set[str]()
+    for path, folders, files in os.walk(folder, followlinks=True):
+        if (place := os.path.realpath(path)) in known:
+            folders.clear()
+        elif RECORD in files:
+            yield Path(path, RECORD)
+        known.add(place)
 
 
 def arguments_to_go_on(record: dict[str, Any]) -> list[str]:
