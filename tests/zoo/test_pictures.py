@@ -287,6 +287,9 @@ def test_plot_draws_seeds_as_one_curve(
         make_run(folders[0], tiny_pearl(), 3, hyperparams={"explorer": {"name": "belief"}, "gamma": 0.5})
         main(["plot", *arguments])
     check_same_settings("none", [])
+    make_run(folders[1], tiny_pearl(seed=2), 3, seed=2)
+    with pytest.raises(ValueError, match="Several runs in other have the seed 2, as a copy of one has"):
+        main(["plot", str(folders[1]), "--only", "learning"])
 
 
 @pytest.mark.parametrize(("only", "n_adapted"), [(["paths", "latent"], 1), (["paths", "adaptation"], 3)])

@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from functools import reduce
 from pathlib import Path
@@ -136,7 +137,7 @@ def check_same_settings(label: str, agents: Sequence[TrainedAgent]) -> None:
     """
     :param label: of the curve
     :param agents: runs that should differ in their seed alone
-    :raises ValueError: if they differ in anything else
+    :raises ValueError: if they differ in anything else, or not in it
     """
     records = [agent.record for agent in agents]
     facts = [training_facts(record.get("hyperparams", {}), record.get("arguments", ())) for record in records]
@@ -146,6 +147,12 @@ def check_same_settings(label: str, agents: Sequence[TrainedAgent]) -> None:
     if different:
         raise ValueError(
             f"The runs in {label} differ in {sorted(different)}: put them into folders of their own, one per curve."
+        )
+    seeds = Counter(record["seed"] for record in records if "seed" in record)
+    if twice := [seed for seed, n in seeds.items() if n > 1]:
+        raise ValueError(
+            f"Several runs in {label} have the seed {twice[0]}, as a copy of one has, and are no runs of their own: leave one "
+            "of them there, or the interval is too narrow."
         )
 
 
