@@ -24,6 +24,11 @@ from sb3_htr.zoo.cli import main
             ["--env", ENV_ID, "-params", "learning_rate:'1e-3'"],
             r"learning_rate is the text '1e-3' \(-params\), expected a number: leave the quotes out",
         ),
+        (
+            ["--env", ENV_ID, "-params", "gamma:0.9", "--hyperparams", "n_envs:2"],
+            "^-params is given twice, and only the last would count: give all pairs behind one",
+        ),
+        (["--env", ENV_ID, "--env-kwargs", "goal_distance:1", "--env-kwargs=goal_radius:1"], "^--env-kwargs is given twice"),
         (["--env", ENV_ID, "-params", "n_envs:0"], "n_envs is 0, expected a whole number of at least 1"),
         (["--env", ENV_ID, "-n", "0"], "n_timesteps is 0, expected a whole number of at least 1"),
         (["--env", ENV_ID, "-params", "n_timesteps:0"], "n_timesteps is 0, expected a number of at least 1"),
@@ -121,3 +126,16 @@ def test_what_cannot_be_shown_is_refused_before_it_begins(
             with pytest.raises(ValueError, match=message):
                 main([command, "--env", ENV_ID, "-f", "nowhere", *arguments])
     assert not capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["goal_distance:1.2", "--env-kwargs", "goal_radius:0.4"], "--env-kwargs is given twice, and only the last would"),
+        (["flag:false"], "--env-kwargs has 'flag:false', which would be a text: expected True, False or None"),
+    ],
+)
+def test_an_argument_of_the_env_is_not_lost(given: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["evaluate", "--env", ENV_ID, "--env-kwargs", *given])
+    assert message in capsys.readouterr().err

@@ -42,7 +42,8 @@ def search_command(folder: Path, storage: str, *more: str, n_trials: int = 2, me
     arguments = ["optimize", "--env", ENV_ID, "-f", str(folder), "-n", "480", "--n-trials", str(n_trials), "--seed", "1"]
     arguments += ["--eval-episodes", "2"]
     # Near goals: trials of any seed have something to report
-    arguments += ["--env-kwargs", "goal_distance:0.1", *(["--method", method] if method else [])]
+    arguments += [] if "--env-kwargs" in more else ["--env-kwargs", "goal_distance:0.1"]
+    arguments += ["--method", method] if method else []
     return [*arguments, "--n-evaluations", "2", "--storage", storage, "--study-name", "test", "--verbose", "0", *more, *SMALL]
 
 

@@ -24,10 +24,14 @@ class KeyValues(argparse.Action):
 
     def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
         pairs = {}
+        if getattr(namespace, self.dest):
+            parser.error(f"{option_string} is given twice, and only the last would count: give all pairs behind one")
         for text in values:
             key, colon, value = text.partition(":")
             if not colon:
                 parser.error(f"{option_string} has {text!r}, expected key:value")
+            if value in ("true", "false", "none", "null"):
+                parser.error(f"{option_string} has {text!r}, which would be a text: expected True, False or None")
             try:
                 pairs[key] = ast.literal_eval(value)
             except (ValueError, SyntaxError):

@@ -5,7 +5,7 @@ from itertools import takewhile
 from typing import Any
 
 from sb3_htr.zoo.run.algorithm import Algorithm
-from sb3_htr.zoo.run.trust import WEIGHTS
+from sb3_htr.zoo.run.trust import KEY_VALUES, WEIGHTS
 
 # PEARL's reference adapts for as many episodes. One thread: two runs on two cores must not fight for them
 ALWAYS = {"--num-threads": "1", "--save-freq": "20000", "--eval-episodes": "20"}
@@ -43,15 +43,20 @@ def spelled_out(arguments: Sequence[str]) -> list[str]:
 
 def check_options(arguments: Sequence[str]) -> None:
     """
-    Those with one dash; rl_zoo3's parser looks at the others.
+    Those with one dash, and those with pairs; rl_zoo3's parser looks at the others.
 
     :param arguments: :func:`spelled_out`
-    :raises ValueError: for one that there is not, such as an abbreviation
+    :raises ValueError: for one that there is not, such as an abbreviation, or one with pairs that would be dropped in silence,
+        as it comes again
     """
-    known = (*JOINED, *APART, *FLAGS)
+    known, given = (*JOINED, *APART, *FLAGS), set[str]()
     for word in arguments:
         if word[:1] == "-" and word[1:2].isalpha() and word not in known:
             raise ValueError(f"There is no option {word}: those with one dash are {', '.join(known)}.")
+        option = {"--hyperparams": "-params"}.get(word, word)
+        if option in KEY_VALUES and option in given:
+            raise ValueError(f"{option} is given twice, and only the last would count: give all pairs behind one.")
+        given.add(option)
 
 
 def value_of(arguments: Sequence[str], *options: str) -> str | None:
