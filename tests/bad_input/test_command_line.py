@@ -29,6 +29,15 @@ from sb3_htr.zoo.cli import main
             "^-params is given twice, and only the last would count: give all pairs behind one",
         ),
         (["--env", ENV_ID, "--env-kwargs", "goal_distance:1", "--env-kwargs=goal_radius:1"], "^--env-kwargs is given twice"),
+        (
+            ["--env", ENV_ID, "--env-kwargs", "goal_distance:1.2", "-params", "env_kwargs:{'goal_radius':0.4}"],
+            "-params has env_kwargs, and there is --env-kwargs: give all arguments of the env by the latter",
+        ),
+        (
+            ["--env", ENV_ID, "-params", "learning_rate:True"],
+            r"learning_rate is True \(-params\), expected a number, or a text such as 'lin_0\.001'",
+        ),
+        (["--env", ENV_ID, "-params", "learning_rate:None"], r"learning_rate is None \(-params\), expected a number"),
         (["--env", ENV_ID, "-params", "n_envs:0"], "n_envs is 0, expected a whole number of at least 1"),
         (["--env", ENV_ID, "-n", "0"], "n_timesteps is 0, expected a whole number of at least 1"),
         (["--env", ENV_ID, "-params", "n_timesteps:0"], "n_timesteps is 0, expected a number of at least 1"),

@@ -111,6 +111,8 @@ class MetaExperimentManager(ExperimentManager):
         if self.resumed is not None:  # what a user gave comes from a file now
             given = checked(given, self.resumed / RECORD)
         checked_kinds(given, "-params" if self.resumed is None else self.resumed / RECORD)
+        if self.env_kwargs and "env_kwargs" in given and self.resumed is None:
+            raise ValueError("-params has env_kwargs, and there is --env-kwargs: give all arguments of the env by the latter.")
         self._given = given
         self._check_use()
         of = self.storage and without_password(self.storage) if self.resumed is None else self.resumed / RECORD
