@@ -108,6 +108,11 @@ def test_a_model_is_trained_on(runs: Path, capsys: pytest.CaptureFixture[str]) -
     model = run_folder(runs) / f"{ENV_ID}.zip"
     assert main(train_arguments(runs / "more", 240, "-i", str(model))) == 0
     assert "Loading pretrained agent" in capsys.readouterr().out
+    other = [word.replace("[16]", "[8]", 1) for word in train_arguments(runs / "other", 240, "-i", str(model))]
+    with pytest.warns(
+        UserWarning, match=r"policy_kwargs \(net_arch\) change nothing, as the networks are those of .*\.zip: leave"
+    ):
+        main(other)
 
 
 def test_an_id_may_have_a_dot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

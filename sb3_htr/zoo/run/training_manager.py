@@ -5,6 +5,7 @@ import errno
 import importlib
 import shutil
 import sys
+import warnings
 from collections.abc import Callable
 from datetime import datetime, timezone
 from functools import partial
@@ -190,6 +191,16 @@ class TrainingManager(MetaExperimentManager):
         return command_to_go_on(Path(self.save_path), record, trust)
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+        networks = hyperparams.get("policy_kwargs") or {}
+        model = self._pretrained(hyperparams, env)
+        if other := sorted(key for key, value in networks.items() if model.policy_kwargs.get(key) != value):
+            warnings.warn(
+                f"policy_kwargs ({', '.join(other)}) change nothing, as the networks are those of {self.trained_agent}: leave "
+                "-i out to have others."
+            )
+        return model
+
+    def _pretrained(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
         if self.trust:
             return super()._load_pretrained_agent(hyperparams, env)
         print("Loading pretrained agent")
