@@ -40,7 +40,9 @@ def run(tmp_path: Path, tiny_pearl: MakePEARL) -> Path:
     return make_run(tmp_path / "logs", tiny_pearl())
 
 
-def test_agents_are_found_by_run_file_and_env(run: Path, tiny_pearl: MakePEARL, tmp_path: Path) -> None:
+def test_agents_are_found_by_run_file_and_env(
+    run: Path, tiny_pearl: MakePEARL, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     logs = tmp_path / "logs"
     last = make_run(logs, tiny_pearl(), number=12)
     with pytest.raises(FileNotFoundError, match=r"SparsePointRobot-v0 run 77 in .*, only runs 1 \(htr-ser\), 12 \(htr-ser\)"):
@@ -54,7 +56,9 @@ def test_agents_are_found_by_run_file_and_env(run: Path, tiny_pearl: MakePEARL, 
     assert agent_at(run / f"{ENV_ID}.zip").folder == run
     assert agent_for(ENV_ID, logs).folder == last, "the latest with a model"
     assert agent_for(ENV_ID, logs, exp_id=1).folder == run
+    assert not capsys.readouterr().err
     assert agent_for(ENV_ID, tmp_path).path == SHIPPED
+    assert f"There is no run of {ENV_ID} in {tmp_path}/, and this agent comes with the package" in capsys.readouterr().err
     assert agent_for(ENV_ID, logs, method="htr-ec").path == shipped("trained_agents") / "htr-ec" / f"{ENV_ID}.zip"
     loose = tmp_path / "loose.zip"
     tiny_pearl().save(loose)
@@ -113,6 +117,11 @@ def test_a_folder_of_seeds_is_one_curve_whatever_else_is_in_it(
 def test_what_chooses_nothing_is_refused(run: Path, more: list[str]) -> None:
     with pytest.raises(ValueError, match="says which agent, so --exp-id and --method choose nothing"):
         main(["evaluate", str(run), *more])
+
+
+def test_an_export_replaces_no_model_of_a_run(run: Path) -> None:
+    with pytest.raises(ValueError, match=r"best_model\.zip is a model of a run, which needs all of it"):
+        main(["export", str(run), "-o", str(run / "best_model.zip")])
 
 
 def test_what_a_killed_export_left_is_no_second_agent(run: Path, tmp_path: Path) -> None:

@@ -129,6 +129,8 @@ def main(argv: Sequence[str]) -> None:
     alone = output.suffix == ".zip"
     if alone and (args.push_to_hub or args.film):
         raise ValueError(f"--push-to-hub and --film need a folder, but the output is the file {output}.")
+    if alone and output.exists() and (output.parent / RECORD).exists():
+        raise ValueError(f"{output} is a model of a run, which needs all of it to be trained further: give another -o.")
     name = model_name(agent.env_id, agent.algorithm.name)
     left = [] if alone else earlier_export(output, files(name))
     repo_id = args.push_to_hub

@@ -296,6 +296,7 @@ def agent_for(
     for name in names if not exp_id else ():
         file = shipped("trained_agents") / name / f"{stem}.zip"
         if file.exists():
+            print(f"There is no run of {env_id} in {folder}/, and this agent comes with the package.", file=sys.stderr)
             return agent_at(file)
     wanted = f"{env_id}" + (f" run {exp_id}" if exp_id else "") + (f" by {method}" if method else "")
     if exp_id and numbers:
