@@ -4,6 +4,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
+from sb3_htr.common.settings import check_numbers
 from sb3_htr.experiments import figures
 from sb3_htr.experiments.ablations import ABLATIONS
 from sb3_htr.experiments.cell import Cell, Evaluation, KwArgs
@@ -12,6 +13,12 @@ from sb3_htr.zoo.run.agents import WRAPPERS
 from sb3_htr.zoo.run.method import get_method
 from sb3_htr.zoo.run.shipped import block_of
 
+# What another argument says, with which a setting would be left out or contradicted in silence
+NO_SETTINGS = {
+    "method": "as the first argument",
+    "n_timesteps": "to the Experiment, and budget, the times of it, to the Variant",
+    "env_kwargs": "as env_kwargs=",
+}
 EXPLORERS = ("belief", "learned-prior", "aggregate", "prior")
 BELIEF = ("belief",)
 
@@ -35,7 +42,7 @@ class Variant:
     :param settings: hyperparameters, joined with those of env and method
     :param env_kwargs: arguments of the env
     :param budget: times the env steps of the experiment
-    :raises ValueError: for wrappers among the settings
+    :raises ValueError: for wrappers among the settings, or for what is no setting
     """
 
     method: str
@@ -50,6 +57,10 @@ class Variant:
                 f"An experiment has no {wrappers[0]}, as its final models are evaluated in the env of its id: register the "
                 "wrapped env under an id of its own."
             )
+        if not isinstance(self.name, str):
+            raise ValueError(f"The name of a Variant is {self.name!r}, expected a text: Variant(method, name, settings).")
+        if elsewhere := sorted(NO_SETTINGS.keys() & self.settings.keys()):
+            raise ValueError(f"{elsewhere[0]} is no setting of a Variant: give it {NO_SETTINGS[elsewhere[0]]}.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +78,7 @@ class Experiment:
     :param figure: draws the results of all cells into a file, the picture that has the experiment's name
     :param also: draw pictures with their own names
     :param n_episodes: adaptation episodes on a task, in training's evaluations and in those of the final models
+    :raises ValueError: for numbers that are none or too small, or without evaluations
     """
 
     name: str
@@ -81,6 +93,18 @@ class Experiment:
     figure: figures.Figure = figures.learning
     also: tuple[figures.Figure, ...] = (figures.reliability,)
     n_episodes: int = 20
+
+    def __post_init__(self) -> None:
+        check_numbers(
+            n_timesteps=(self.n_timesteps, 1.0),
+            seeds=(self.seeds, 1),
+            eval_freq=(self.eval_freq, 1),
+            n_episodes=(self.n_episodes, 1),
+        )
+        if not self.evaluations:
+            raise ValueError(
+                f"The experiment {self.name} has no evaluations, of which its table is: leave them out, or name one."
+            )
 
     def cells(self, seeds: int | None = None, scale: float = 1.0) -> list[Cell]:
         """

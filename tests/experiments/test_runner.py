@@ -66,6 +66,34 @@ def test_what_could_not_be_evaluated_is_not_trained(
         run_cell(cell, tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("variant", "message"),
+    [
+        ({"settings": {"method": "htr-ec"}}, "method is no setting of a Variant: give it as the first argument"),
+        ({"settings": {"n_timesteps": 100}}, "n_timesteps is no setting of a Variant: give it to the Experiment, and budget"),
+        ({"settings": {"env_kwargs": {}}}, "env_kwargs is no setting of a Variant: give it as env_kwargs="),
+        ({"name": {"gamma": 0.9}}, r"The name of a Variant is {'gamma': 0\.9}, expected a text: Variant\(method, name, sett"),
+    ],
+)
+def test_what_is_no_setting_of_a_variant_is_refused_before_it_is_trained(variant: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Variant("htr-ser", **variant)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"seeds": 0}, "seeds is 0, expected a whole number of at least 1"),
+        ({"seeds": [1, 2]}, r"seeds is \[1, 2\], expected a whole number"),
+        ({"eval_freq": -1}, "eval_freq is -1, expected a whole number of at least 1"),
+        ({"evaluations": ()}, "The experiment x has no evaluations, of which its table is"),
+    ],
+)
+def test_an_experiment_without_a_result_is_refused_before_it_is_run(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Experiment("x", "", ENV_ID, 480, (Variant("htr-ser"),), **given)
+
+
 @pytest.mark.parametrize(("name", "variants"), [("other", (Variant("htr-ser"),)), ("one", ())])
 def test_an_experiment_has_the_name_that_it_is_called_by(
     name: str, variants: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
