@@ -83,6 +83,8 @@ def test_runs_may_be_links_and_count_once(run: Path, tiny_pearl: MakePEARL, tmp_
     for name, target in {"one": run, "another": other, "latest": other, "all": chosen}.items():
         (chosen / name).symlink_to(target)
     assert {path.resolve() for path in find_runs(chosen)} == {run, other} and len(find_runs(chosen)) == 2
+    (tmp_path / "logs" / "a_link").symlink_to(run)
+    assert {*find_runs(tmp_path / "logs")} == {run, other}, "by the names that they have of their own"
 
 
 def test_the_newest_run_is_the_one_that_was_begun_last(tiny_pearl: MakePEARL, tmp_path: Path) -> None:

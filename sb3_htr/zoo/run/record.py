@@ -53,13 +53,16 @@ def records_in(folder: Path) -> Iterator[Path]:
     :param folder: a run folder, or a folder with runs somewhere in it, or links to some
     :return: their records, each once
     """
-    known = set[str]()
-    for path, folders, files in os.walk(folder, followlinks=True):
-        if (place := os.path.realpath(path)) in known:
-            folders.clear()
-        elif RECORD in files:
-            yield Path(path, RECORD)
-        known.add(place)
+    known, places = set[str](), [os.fspath(folder)]
+    for place in places:  # links last, so that a run has its own name
+        for path, folders, files in os.walk(place):
+            if (real := os.path.realpath(path)) in known:
+                folders.clear()
+                continue
+            known.add(real)
+            if RECORD in files:
+                yield Path(path, RECORD)
+            places += [link for name in folders if os.path.islink(link := os.path.join(path, name))]
 
 
 def arguments_to_go_on(record: dict[str, Any]) -> list[str]:
