@@ -288,12 +288,12 @@ class MetaEnv(HasTaskFamily, gym.Env[FloatArray, FloatArray], ABC):
                 f"terminates. Expected an observation of shape {self.observation_space.shape}, got {given}."
             )
         dtype = self.observation_space.dtype
-        if dtype.kind != "f" and (given_dtype := np.asarray(state).dtype).kind == "f":
-            raise ValueError(
-                f"The observation is of dtype {given_dtype}, but the observation space of {dtype}, which would cut it: give "
-                "the env a Box of float32."
-            )
         observation: FloatArray = np.array(state, dtype=dtype)
+        if dtype.kind != "f" and not np.array_equal(observation, state):
+            raise ValueError(
+                f"The observation {np.asarray(state)} would be cut to {dtype}, which the observation space is of: give the "
+                "env a Box of float32."
+            )
         self._last_observation = observation.astype(np.float32)
         return observation
 
