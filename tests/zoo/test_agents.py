@@ -58,8 +58,9 @@ def test_agents_are_found_by_run_file_and_env(
     assert agent_for(ENV_ID, logs, exp_id=1).folder == run
     assert not capsys.readouterr().err
     assert agent_for(ENV_ID, tmp_path).path == SHIPPED
-    assert f"There is no run of {ENV_ID} in {tmp_path}/, and this agent comes with the package" in capsys.readouterr().err
+    assert f"{tmp_path}/ has no trained agent for {ENV_ID}, so this one comes with the package" in capsys.readouterr().err
     assert agent_for(ENV_ID, logs, method="htr-ec").path == shipped("trained_agents") / "htr-ec" / f"{ENV_ID}.zip"
+    assert f"for {ENV_ID} by htr-ec, so this one" in capsys.readouterr().err, "there are runs, by another method"
     loose = tmp_path / "loose.zip"
     tiny_pearl().save(loose)
     assert agent_at(loose, env_id=ENV_ID).env_id == ENV_ID

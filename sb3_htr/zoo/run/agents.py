@@ -293,12 +293,12 @@ def agent_for(
             # A run that has no model yet is passed over, if it was not asked for
             if exp_id or (run / "best_model.zip").exists() or (run / f"{stem}.zip").exists():
                 return agent_at(run, which)
+    wanted = f"{env_id}" + (f" run {exp_id}" if exp_id else "") + (f" by {method}" if method else "")
     for name in names if not exp_id else ():
         file = shipped("trained_agents") / name / f"{stem}.zip"
         if file.exists():
-            print(f"There is no run of {env_id} in {folder}/, and this agent comes with the package.", file=sys.stderr)
+            print(f"{folder}/ has no trained agent for {wanted}, so this one comes with the package.", file=sys.stderr)
             return agent_at(file)
-    wanted = f"{env_id}" + (f" run {exp_id}" if exp_id else "") + (f" by {method}" if method else "")
     if exp_id and numbers:
         raise FileNotFoundError(f"There is no trained agent for {wanted} in {folder}/, only runs {', '.join(numbers)}.")
     given = f" --method {method}" if method else ""
