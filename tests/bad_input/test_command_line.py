@@ -141,7 +141,10 @@ def test_what_cannot_be_shown_is_refused_before_it_begins(
     ("given", "message"),
     [
         (["goal_distance:1.2", "--env-kwargs", "goal_radius:0.4"], "--env-kwargs is given twice, and only the last would"),
-        (["flag:false"], "--env-kwargs has 'flag:false', which would be a text: expected True, False or None"),
+        (
+            ["flag:false"],
+            "has 'flag:false', which would be a text: expected True, False or None, or flag:\"'false'\" for the text",
+        ),
     ],
 )
 def test_an_argument_of_the_env_is_not_lost(given: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -31,7 +31,8 @@ class KeyValues(argparse.Action):
             if not colon:
                 parser.error(f"{option_string} has {text!r}, expected key:value")
             if value in ("true", "false", "none", "null"):
-                parser.error(f"{option_string} has {text!r}, which would be a text: expected True, False or None")
+                told = f"expected True, False or None, or {key}:\"'{value}'\" for the text"
+                parser.error(f"{option_string} has {text!r}, which would be a text: {told}")
             try:
                 pairs[key] = ast.literal_eval(value)
             except (ValueError, SyntaxError):
