@@ -273,6 +273,7 @@ ALL = (
         eval_freq=100_000,
         evaluations=by((*BELIEF, "training tasks in turn")),
         models_of="ant",
+        figure=figures.evaluations,
     ),
     Experiment(
         "wheeled",
