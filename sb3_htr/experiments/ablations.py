@@ -70,8 +70,9 @@ class NoInference(Belief):
 @dataclass
 class InTurn(Explorer):
     """
-    No inference, no critics, no model: the training tasks that were solved are tried one after another, an episode each. The
-    first is in the middle, each next one is the furthest from all before, by z. The first z that is rewarded is kept.
+    No inference and no critics: the training tasks that were solved are tried one after another, an episode each. The first is
+    in the middle, each next one is the furthest from all before, by z. The first z that is rewarded is kept; what a reward is,
+    the model of task-free rewards says, as to all explorers.
     """
 
     needs_success: ClassVar[bool] = True
