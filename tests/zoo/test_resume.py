@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -24,10 +24,11 @@ from helpers.runs import run_folder
 from sb3_htr import PEARL
 from sb3_htr.adaptation.evaluation import AdaptationRecord
 from sb3_htr.common.checkpoint import checkpoints, load_latest, write_checkpoint
-from sb3_htr.common.checkpoint_callback import cut_monitor_files
+from sb3_htr.common.checkpoint_callback import CheckpointCallback, cut_monitor_files
 from sb3_htr.common.versions import named
 from sb3_htr.zoo.cli import main
 from sb3_htr.zoo.run.shipped import hyperparams_file
+from sb3_htr.zoo.run.soft_interrupt import soft_interrupt
 from sb3_htr.zoo.run.training_manager import TrainingManager
 
 # Rollouts of 4 tasks x 3 episodes x 20 steps, 10 of them, a checkpoint after each
@@ -340,6 +341,28 @@ def test_an_interrupt_stops_with_a_checkpoint_and_says_how_to_go_on(kind: int, u
     assert "Press Ctrl-C again" in output
     assert main(["train", "--resume", str(run)]) == 0
     assert_same_run(run, unbroken)
+
+
+def test_a_second_interrupt_stops_at_once_also_in_a_script_s_background() -> None:
+    """Shells start the background commands of scripts with Ctrl-C ignored; who sends it to one of them means it."""
+
+    class Checkpointing:
+        stopped = 0
+
+        def stop(self) -> None:
+            self.stopped += 1
+
+    checkpointing = Checkpointing()
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with soft_interrupt(cast(CheckpointCallback, checkpointing)):
+            signal.raise_signal(signal.SIGINT)
+            assert checkpointing.stopped == 1
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 FRAGILE = """

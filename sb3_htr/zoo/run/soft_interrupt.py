@@ -20,7 +20,9 @@ def soft_interrupt(checkpointing: CheckpointCallback | None) -> Iterator[None]:
 
     def stop(signum: int, frame: Any) -> None:
         # One of the other kind may be the same wish, as a scheduler tells all processes, and one of them tells others
-        signal.signal(signum, before[signal.Signals(signum)])
+        handler = before[signal.Signals(signum)]
+        # Shells have the background commands of a script ignore Ctrl-C
+        signal.signal(signum, signal.default_int_handler if handler is signal.SIG_IGN else handler)
         print("Stopping after this rollout, with a checkpoint. Press Ctrl-C again to stop at once.")
         checkpointing.stop()
 
