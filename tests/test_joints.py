@@ -359,6 +359,15 @@ def test_a_loss(tmp_path: Path, cuda_graph: bool) -> None:
     assert "train/decoder_loss" in loaded.logger.name_to_value
 
 
+def test_a_loss_has_a_name_of_its_own() -> None:
+    class Nameless(PEARL):
+        def auxiliary_losses(self, data: Any, obs: th.Tensor, z: th.Tensor, *posterior: th.Tensor) -> dict[str, th.Tensor]:
+            return {**super().auxiliary_losses(data, obs, z, *posterior), "critic_loss": z.square().mean()}
+
+    with pytest.raises(ValueError, match="auxiliary_losses has a loss named critic_loss, which is logged already"):
+        Nameless("MlpPolicy", ENV_ID, **TINY).learn(3 * ROLLOUT)
+
+
 # --- an env family
 
 

@@ -78,7 +78,7 @@ class Experiment:
     :param figure: draws the results of all cells into a file, the picture that has the experiment's name
     :param also: draw pictures with their own names
     :param n_episodes: adaptation episodes on a task, in training's evaluations and in those of the final models
-    :raises ValueError: for numbers that are none or too small, or without evaluations
+    :raises ValueError: for numbers that are none or too small, without evaluations, or for a figure that is no function
     """
 
     name: str
@@ -105,6 +105,11 @@ class Experiment:
             raise ValueError(
                 f"The experiment {self.name} has no evaluations, of which its table is: leave them out, or name one."
             )
+        for figure in (self.figure, *self.also):
+            if not callable(figure):
+                raise ValueError(
+                    f"A figure of the experiment {self.name} is {figure!r}, expected a function, as figures.learning."
+                )
 
     def cells(self, seeds: int | None = None, scale: float = 1.0) -> list[Cell]:
         """

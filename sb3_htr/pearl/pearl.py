@@ -333,12 +333,14 @@ class PEARL(OffPolicyMetaAlgorithm):
             "critic_loss": critic_loss.detach(),
             "actor_loss": actor_loss.detach(),
             "kl_divergence": kl.detach(),
-            **{name: value.detach() for name, value in auxiliary_losses.items()},
             "ent_coef": ent_coef.detach().mean(),
             "posterior_std": (variance.detach().sqrt().mean(dim=1) * data.task_weights).sum(),
             "q_value": (q.detach().mean(dim=0) * weight).sum(),
             "rl_reward_mean": (data.rewards * weight).sum(),
         }
+        if taken := sorted(log.keys() & auxiliary_losses.keys()):
+            raise ValueError(f"auxiliary_losses has a loss named {taken[0]}, which is logged already: choose another name.")
+        log |= {name: value.detach() for name, value in auxiliary_losses.items()}
         return mean.detach(), log
 
     def auxiliary_losses(
@@ -356,7 +358,8 @@ class PEARL(OffPolicyMetaAlgorithm):
         :param z: (M, latent_dim), drawn from the posteriors, with gradients to the encoder
         :param mean: (M, latent_dim) of the posteriors
         :param variance: (M, latent_dim) of the posteriors
-        :return: scalars, which are added to the loss of encoder and critics, and logged as ``train/`` and their name
+        :return: scalars, which are added to the loss of encoder and critics, and logged as ``train/`` and their name, which no
+            other value has
         """
         labels = data.labels
         if labels is None:

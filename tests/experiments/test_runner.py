@@ -87,6 +87,8 @@ def test_what_is_no_setting_of_a_variant_is_refused_before_it_is_trained(variant
         ({"seeds": [1, 2]}, r"seeds is \[1, 2\], expected a whole number"),
         ({"eval_freq": -1}, "eval_freq is -1, expected a whole number of at least 1"),
         ({"evaluations": ()}, "The experiment x has no evaluations, of which its table is"),
+        ({"figure": "learning"}, "A figure of the experiment x is 'learning', expected a function, as figures.learning"),
+        ({"also": ("race",)}, "A figure of the experiment x is 'race', expected a function"),
     ],
 )
 def test_an_experiment_without_a_result_is_refused_before_it_is_run(given: dict[str, Any], message: str) -> None:

@@ -340,13 +340,19 @@ def test_plot_says_what_is_missing_in_a_curve(
     with np.load(runs[2] / "evaluations.npz") as file:
         first = {name: values[:1] for name, values in file.items()}
     np.savez(runs[2] / "evaluations.npz", **first)
-    far = make_run(tmp_path / "far", model, env_kwargs={"goal_distance": 2.0})
+    other_code = {"commit": "0123456789", "versions": {"torch": "1.0"}}
+    far = make_run(tmp_path / "far", model, env_kwargs={"goal_distance": 2.0}, **other_code)
     command = ["plot", str(tmp_path / "runs"), str(far), "-l", "near", "far", "--only", "learning", "-o", str(tmp_path / "o")]
     assert main(command) == 0
     said = capsys.readouterr().err
     assert f"{runs[1]} has no evaluations.npz, and is not in the learning curve" in said
     assert f"{runs[2]} was evaluated up to 480 of 960 env steps, where the curve of near ends" in said
     assert "different arguments, {'near': {}, 'far': {'goal_distance': 2.0}}: their tasks are not the same" in said
+    assert "Not all of these runs were made by one code: commit unknown -> 0123456789, torch unknown -> 1.0." in said
+    assert main([*command[:2], *command[6:]]) == 0
+    assert "one code" not in capsys.readouterr().err
+    with pytest.raises(ValueError, match=r"-o is learning.svg, expected a folder"):
+        main(["plot", *NOWHERE, "-o", "learning.svg"])
     (tmp_path / "file").touch()
     with pytest.raises(FileExistsError):
         main(["plot", *NOWHERE, "-o", str(tmp_path / "file")])

@@ -16,6 +16,7 @@ from sb3_htr.adaptation.loop import Adapting
 from sb3_htr.common.arrays import load_arrays
 from sb3_htr.common.checks import get_task_family
 from sb3_htr.common.vec_env import N_ENVS
+from sb3_htr.common.versions import differences
 from sb3_htr.zoo.commands.arguments import add_adaptation_arguments, add_agent_arguments, chosen_agent, make_parser
 from sb3_htr.zoo.plots.adaptation import plot_adaptation_curve, plot_adaptation_paths, start_position
 from sb3_htr.zoo.plots.curves import Curve, plot_curves
@@ -130,6 +131,9 @@ def groups_of(parser: argparse.ArgumentParser, args: argparse.Namespace) -> dict
     of_each = {label: agents[0].env_kwargs for label, agents in groups.items()}
     if any(kwargs != next(iter(of_each.values())) for kwargs in of_each.values()):
         print(f"The envs of these curves have different arguments, {of_each}: their tasks are not the same.", file=sys.stderr)
+    records = [agent.record for agents in groups.values() for agent in agents]
+    if other := dict.fromkeys(difference for record in records for difference in differences(records[0], record)):
+        print(f"Not all of these runs were made by one code: {', '.join(other)}. Curves may differ by it.", file=sys.stderr)
     return groups
 
 
@@ -213,6 +217,8 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--format", choices=FORMATS, default="png", help="of the pictures (default: png)")
     parser.add_argument("--only", nargs="+", choices=PICTURES, default=PICTURES, help="pictures to draw (default: all)")
     args = parser.parse_args(argv)
+    if args.output.suffix[1:] in FORMATS:
+        raise ValueError(f"-o is {args.output}, expected a folder: pictures have their own names, and --format is their kind.")
     groups = groups_of(parser, args)
     args.output.mkdir(parents=True, exist_ok=True)  # before any work
     env_id = next(iter(groups.values()))[0].env_id
