@@ -22,6 +22,7 @@ from htr_envs.dynamics import Dynamics, DynamicsVectorEnv, refuse_pictures
 from htr_envs.headless import open_no_window
 from htr_envs.position_goals import PositionGoalFamily
 from htr_envs.task_env import BoolArray, FloatArray
+from htr_envs.task_sets import are_numbers
 
 try:
     import mujoco
@@ -95,12 +96,12 @@ class MujocoDynamics(Dynamics[PositionGoalFamily]):
         reset_noise_scale: float,
         observation_bounds: FloatArray,
     ) -> None:
-        if not 0.0 <= reset_noise_scale < np.inf:
-            raise ValueError(f"reset_noise_scale is {reset_noise_scale}, expected a finite number from 0 on.")
+        if not are_numbers(reset_noise_scale) or not 0.0 <= reset_noise_scale < np.inf:
+            raise ValueError(f"reset_noise_scale is {reset_noise_scale!r}, expected a finite number from 0 on.")
         if n_threads is None:
             n_threads = min(available_threads(), max(1, num_envs // self.envs_per_thread))
-        if n_threads < 1:
-            raise ValueError(f"n_threads is {n_threads}: pass at least 1, or None for as many as there are CPUs.")
+        if not isinstance(n_threads, int | np.integer) or n_threads < 1:
+            raise ValueError(f"n_threads is {n_threads!r}: pass a whole number from 1 on, or None for as many as CPUs.")
         # a state that is not finite is not replaced by the first one: the episode ends
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART | mujoco.mjtDisableBit.mjDSBL_AUTORESET
         _add_discs(spec)

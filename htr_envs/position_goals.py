@@ -7,6 +7,7 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike
 
 from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, at_step, check_reward_type, l2_distance
+from htr_envs.task_sets import are_numbers
 
 
 class PositionGoalFamily(TaskFamily):
@@ -35,9 +36,9 @@ class PositionGoalFamily(TaskFamily):
         validation_tasks: FloatArray,
         test_tasks: FloatArray,
     ) -> None:
-        if not 0.0 < goal_radius <= 1.0:
+        if not are_numbers(goal_radius) or not 0.0 < goal_radius <= 1.0:
             raise ValueError(
-                f"goal_radius is {goal_radius}, expected above 0 and at most 1, so that a success is worth 1 - d > 0."
+                f"goal_radius is {goal_radius!r}, expected above 0 and at most 1, so that a success is worth 1 - d > 0."
             )
         self.goal_radius = float(goal_radius)
         super().__init__(spaces.Box(-arena, arena, (2,), np.float32), train_tasks, validation_tasks, test_tasks)

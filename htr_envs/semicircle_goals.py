@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from htr_envs.position_goals import PositionGoalFamily
 from htr_envs.task_env import FloatArray
-from htr_envs.task_sets import draw_task_sets
+from htr_envs.task_sets import are_numbers, draw_task_sets
 
 LOCOMOTION_ARENA = 20.0  # a robot gets up to 10 in 200 steps
 
@@ -54,8 +54,8 @@ class SemicircleGoalFamily(PositionGoalFamily):
         task_seed: int = 1337,
         held_out: tuple[float, float] | None = None,
     ) -> None:
-        if not 0.0 < goal_distance <= arena:
-            raise ValueError(f"goal_distance is {goal_distance}, expected a number above 0 and up to {arena}.")
+        if not are_numbers(goal_distance) or not 0.0 < goal_distance <= arena:
+            raise ValueError(f"goal_distance is {goal_distance!r}, expected a number above 0 and up to {arena}.")
         self.goal_distance = float(goal_distance)
         sector = None if held_out is None else _part(held_out)
         drawn = draw_task_sets(n_train_tasks, n_validation_tasks, n_test_tasks, task_seed, sector)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from htr_envs.dynamics import Dynamics, DynamicsEnv, DynamicsVectorEnv, refuse_pictures
 from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, at_step, check_reward_type, l2_distance
-from htr_envs.task_sets import draw_task_sets
+from htr_envs.task_sets import are_numbers, draw_task_sets
 
 FRICTION = np.float32(0.95)
 THRUST = np.float32(0.2)
@@ -45,12 +45,12 @@ class TargetSpeedFamily(TaskFamily):
         n_validation_tasks: int = 20,
         task_seed: int = 1337,
     ) -> None:
-        if not 0.0 < min_speed < max_speed <= TOP_SPEED:
+        if not are_numbers(min_speed, max_speed) or not 0.0 < min_speed < max_speed <= TOP_SPEED:
             raise ValueError(
-                f"min_speed, max_speed are {min_speed}, {max_speed}, expected 0 < min_speed < max_speed <= {TOP_SPEED}."
+                f"min_speed, max_speed are {min_speed!r}, {max_speed!r}, expected 0 < min_speed < max_speed <= {TOP_SPEED}."
             )
-        if not tolerance > 0.0:
-            raise ValueError(f"tolerance is {tolerance}, expected a number above 0.")
+        if not are_numbers(tolerance) or not tolerance > 0.0:
+            raise ValueError(f"tolerance is {tolerance!r}, expected a number above 0.")
         self.min_speed = float(min_speed)
         self.max_speed = float(max_speed)
         self.tolerance = float(tolerance)

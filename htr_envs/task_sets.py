@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
+from numbers import Real
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 # How near drawn tasks may be to others, as shares of the range, and how often they are drawn until none is nearer
 NEAREST, MAX_DRAWS = 1e-6, 100
+
+
+def are_numbers(*values: Any) -> bool:
+    """Whether comparing these with a number says something: arguments of an env come from YAML files and command lines.
+
+    :param values: arguments of an env.
+    :returns: whether each of them is a number.
+    """
+    return all(isinstance(value, Real) and not isinstance(value, bool) for value in values)
 
 
 def check_task_sets(n_train_tasks: int, n_validation_tasks: int, n_test_tasks: int, task_seed: int) -> None:

@@ -279,6 +279,24 @@ def test_threads_make_no_difference_to_a_single_env() -> None:
             gym.make(env_id, n_threads=0)
 
 
+@pytest.mark.parametrize(
+    ("env_id", "argument"),
+    [
+        ("SparsePointRobot-v0", "goal_distance"),
+        ("SparsePointRobot-v0", "goal_radius"),
+        ("SparseTargetSpeed-v0", "min_speed"),
+        ("SparseTargetSpeed-v0", "max_speed"),
+        ("SparseTargetSpeed-v0", "tolerance"),
+        ("SparseWheeled-v0", "reset_noise_scale"),
+        ("SparseWheeled-v0", "n_threads"),
+    ],
+)
+def test_an_argument_that_is_no_number_is_named(env_id: str, argument: str) -> None:
+    given: dict[str, Any] = {argument: "1,5"}
+    with pytest.raises(ValueError, match=rf"{argument}.* '1,5'"):
+        gym.make(env_id, **given)
+
+
 # ---------------------------------------------------------------- the rules on tasks
 
 

@@ -340,7 +340,7 @@ def test_plot_says_what_is_missing_in_a_curve(
     with np.load(runs[2] / "evaluations.npz") as file:
         first = {name: values[:1] for name, values in file.items()}
     np.savez(runs[2] / "evaluations.npz", **first)
-    other_code = {"commit": "0123456789", "versions": {"torch": "1.0"}}
+    other_code: dict[str, Any] = {"commit": "0123456789", "versions": {"torch": "1.0"}}
     far = make_run(tmp_path / "far", model, env_kwargs={"goal_distance": 2.0}, **other_code)
     command = ["plot", str(tmp_path / "runs"), str(far), "-l", "near", "far", "--only", "learning", "-o", str(tmp_path / "o")]
     assert main(command) == 0
