@@ -1,4 +1,4 @@
-"""Float32 products of a linear layer: through oneDNN, as ``sb3_htr.common.linear`` does, against torch's own."""
+"""Float32 products of a linear layer: through oneDNN, as ``sb3_htr.common.linear`` has them, against torch's own."""
 
 from functools import partial
 from unittest import mock
@@ -10,7 +10,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_htr.common import linear
-from sb3_htr.common.linear import Linear, Stack, _product
+from sb3_htr.common.linear import Linear, Stack, _product, find_onednn
 
 # Rows and units: a critic and the encoder at the paper's sizes, a critic of the fast profile
 SHAPES = [(4096, 300), (16384, 200), (1024, 128)]
@@ -29,6 +29,7 @@ def public_product(x: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tenso
 def main() -> None:
     """One thread."""
     th.set_num_threads(1)
+    linear.onednn = find_onednn()  # also on a processor where it is not the faster one
     figures = []
     for n, units in SHAPES:
         x, weight, bias = th.randn(n, units), th.randn(units, units), th.randn(units)

@@ -1,6 +1,6 @@
 """
 Linear layers, and stacks of them, through oneDNN, whose float32 products on processors that are not Intel's are twice as fast
-as MKL's.
+as MKL's, which torch takes.
 """
 
 from collections.abc import Callable, Iterator
@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 import torch as th
 from torch import nn
 from torch.nn import functional as F
+
+from sb3_htr.common.versions import processor
 
 # Products of fewer multiplications are left to MKL, which begins sooner, and batches of fewer rows to torch.nn; by measurement
 MIN_MULTIPLICATIONS, MIN_ROWS = 2**20, 64
@@ -35,8 +37,16 @@ def find_onednn() -> Callable[[th.Tensor, th.Tensor, th.Tensor | None, str], th.
     return product if result.tolist() == [[0.0], [7.5]] else None
 
 
+def faster_than_torch() -> Callable[[th.Tensor, th.Tensor, th.Tensor | None, str], th.Tensor] | None:
+    """
+    :return: as :func:`find_onednn`; None on Intel's processors, too. There MKL's products are as fast as oneDNN's, and need no
+        copies of what is transposed
+    """
+    return None if "Intel" in processor() else find_onednn()
+
+
 #: None leaves all products to torch
-onednn = find_onednn()
+onednn = faster_than_torch()
 
 
 class _Layer(NamedTuple):
@@ -189,7 +199,7 @@ class Linear(nn.Linear):
     """
     ``nn.Linear`` with the same parameters and results, for batches of rows (n, in_features).
 
-    Elsewhere than on a CPU with oneDNN, for few rows, for other than float32, and where
+    Elsewhere than on a CPU that is not Intel's, for few rows, for other than float32, and where
     ``torch.set_float32_matmul_precision`` allows less than that, it is ``nn.Linear``.
     """
 

@@ -34,8 +34,9 @@ LAYERS = {
 
 @pytest.fixture
 def everything_through_onednn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Small products too."""
+    """Small products too, and on every processor."""
     monkeypatch.setattr(linear, "MIN_MULTIPLICATIONS", 0)
+    monkeypatch.setattr(linear, "onednn", find_onednn())
 
 
 def gradients(layer: nn.Module, x: th.Tensor, loss_weight: th.Tensor) -> list[th.Tensor]:
@@ -63,7 +64,7 @@ def test_results_and_gradients_are_those_of_torch(n: int, n_in: int, n_out: int,
 @pytest.fixture
 def onednn_rows(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Rows of each product that oneDNN is asked for."""
-    rows, fastest = list[int](), linear.onednn
+    rows, fastest = list[int](), find_onednn()
     assert fastest is not None
 
     def product(x: th.Tensor, *others: Any) -> th.Tensor:
@@ -148,6 +149,18 @@ def test_an_output_may_be_overwritten_as_that_of_torch_may() -> None:
     th.testing.assert_close(*grads, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("name", "takes_onednn"),
+    [("AMD EPYC", True), ("Intel(R) Xeon(R) Processor", False), ("Intel64 Family 6, GenuineIntel", False), ("arm", True)],
+)
+def test_products_are_left_to_torch_where_these_are_as_fast(
+    name: str, takes_onednn: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(linear, "processor", lambda: name)
+    assert (linear.faster_than_torch() is not None) is takes_onednn
+
+
+@pytest.mark.usefixtures("everything_through_onednn")
 def test_a_torch_without_the_private_operation_uses_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     assert find_onednn() is not None, "the tested version of torch has it"
     layer, x = Linear(64, 64), th.randn(1024, 64)
@@ -171,6 +184,7 @@ def test_replaced_layers_keep_their_parameters() -> None:
     assert all(th.equal(before[name], value) for name, value in module.state_dict().items())
 
 
+@pytest.mark.usefixtures("everything_through_onednn")
 def test_second_derivatives_are_refused() -> None:
     layer, x = Linear(8, 8), th.randn(MIN_ROWS, 8, requires_grad=True)
     with pytest.raises(RuntimeError, match=r"no second derivatives \(create_graph\)"):
