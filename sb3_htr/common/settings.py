@@ -96,7 +96,8 @@ def check_numbers(**numbers: tuple[Any, float] | tuple[Any, float, float]) -> No
         kind = int if whole else int | float
         # written so that nan, which compares with nothing, is refused too
         if isinstance(value, bool) or not (isinstance(value, kind) and low <= value <= high):
-            article = "a whole number" if whole else "a number"
+            is_infinite = isinstance(value, float) and np.isinf(value)
+            article = "a whole number" if whole else "a finite number" if is_infinite else "a number"
             # Whole numbers in full: of a large one, the first digits are another number
             least, most = (limit if isinstance(limit, int) else f"{limit:g}" for limit in (low, high))
             limits = f" of at least {least}" if high >= sys.float_info.max else f" from {least} to {most}"

@@ -123,7 +123,7 @@ def test_half_a_trial_is_refused(trial: list[str], tmp_path: Path) -> None:
         (["--n-timesteps", "-5"], "--n-timesteps is -5, expected a whole number of at least 1"),
         (["--fps", "0"], r"--fps is 0\.0, expected a number of at least 0\.1"),
         (["--fps", "-3"], r"--fps is -3\.0, expected a number of at least 0\.1"),
-        (["--fps", "inf"], "--fps is inf, expected a number of at least"),
+        (["--fps", "inf"], "--fps is inf, expected a finite number of at least"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
