@@ -191,9 +191,9 @@ class AntEnv(DynamicsEnv):
     ## Task distribution
 
     A task is a goal position `(x, y)` at `goal_distance` from the start, at an angle between 0 and pi. The 80 training tasks
-    are four fifths of 100 evenly spaced angles, shuffled by `task_seed`. The 20 validation and the 100 test tasks are drawn,
-    uniformly and in balance: one from each of as many equal sectors. `task_space` is a square that no ant leaves within 200
-    steps, because a hindsight task is any position that the ant reached.
+    are four fifths of 100 angles, evenly spaced from end to end and shuffled by `task_seed`. The 20 validation and the 100
+    test tasks are drawn, uniformly and in balance: one from each of as many equal sectors. `task_space` is a square that
+    no ant leaves within 200 steps, because a hindsight task is any position that the ant reached.
 
     The distance 2, the angles and the 200 steps are MAESN's. The training tasks have the angles of PEARL's point robot, the
     validation and test tasks are our choice. A control step is 0.05 s, as in PEARL's ants: MAESN's 0.01 s leave 2 seconds to

@@ -109,9 +109,9 @@ class PointRobotEnv(DynamicsEnv):
     ## Task distribution
 
     A task is a goal position `(x, y)` at `goal_distance` from the start, at an angle between 0 and pi. The 80 training tasks
-    are four fifths of 100 evenly spaced angles, shuffled by `task_seed`. The 20 validation and the 100 test tasks are drawn,
-    uniformly and in balance: one from each of as many equal sectors. `task_space` is the whole arena, because a hindsight task
-    is any position that the robot reached.
+    are four fifths of 100 angles, evenly spaced from end to end and shuffled by `task_seed`. The 20 validation and the 100
+    test tasks are drawn, uniformly and in balance: one from each of as many equal sectors. `task_space` is the whole arena,
+    because a hindsight task is any position that the robot reached.
 
     The paper gives the two rewards and the radius 0.2. It does not give the goal distance, the training tasks, the episode
     length and the step size: those are PEARL's, taken from its reference implementation, which tests on the 20 other angles.

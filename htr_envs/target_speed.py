@@ -174,11 +174,11 @@ class TargetSpeedEnv(DynamicsEnv):
 
     ## Task distribution
 
-    A task is a speed between `min_speed` and `max_speed`. The 80 training tasks are four fifths of 100 evenly spaced speeds,
-    shuffled by `task_seed`; validation and test tasks are drawn uniformly and in balance. `task_space` goes from 0 beyond the
-    largest possible speed, because a hindsight task is any speed that was reached. The family is our own, its numbers chosen
-    such that undirected thrust does not get there: a uniformly random policy holds its target at some step of 0.01 % of its
-    episodes (of 25,000, by `examples/floor_and_ceiling.py`).
+    A task is a speed between `min_speed` and `max_speed`. The 80 training tasks are four fifths of 100 speeds, evenly
+    spaced from end to end and shuffled by `task_seed`; validation and test tasks are drawn uniformly and in balance.
+    `task_space` goes from 0 beyond the largest possible speed, because a hindsight task is any speed that was reached. The
+    family is our own, its numbers chosen such that undirected thrust does not get there: a uniformly random policy holds its
+    target at some step of 0.01 % of its episodes (of 25,000, by `examples/floor_and_ceiling.py`).
 
     ## Starting State
 

@@ -133,9 +133,9 @@ class WheeledEnv(DynamicsEnv):
     ## Task distribution
 
     A task is a goal position `(x, y)` at `goal_distance` from the start, at an angle between 0 and pi. The 80 training tasks
-    are four fifths of 100 evenly spaced angles, shuffled by `task_seed`. The 20 validation and the 100 test tasks are drawn,
-    uniformly and in balance: one from each of as many equal sectors. `task_space` is a square that no robot leaves within 200
-    steps, because a hindsight task is any position that the robot reached.
+    are four fifths of 100 angles, evenly spaced from end to end and shuffled by `task_seed`. The 20 validation and the 100
+    test tasks are drawn, uniformly and in balance: one from each of as many equal sectors. `task_space` is a square that
+    no robot leaves within 200 steps, because a hindsight task is any position that the robot reached.
 
     The distance 2, the angles and the 200 steps of 0.01 s are MAESN's. The training tasks have the angles of
     PEARL's point robot, the validation and test tasks are our choice. So is the radius 0.5, where MAESN has 0.8: a larger
