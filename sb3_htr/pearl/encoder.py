@@ -30,8 +30,9 @@ class ContextEncoder(nn.Module):
     """
     Maps a set of transitions (o, a, r), or (o, a, r, o'), to a Gaussian posterior over the task variable z, in any order.
 
-    The posterior is a product of Gaussians, one factor for each transition. What was taken in of a task is the sum of the
-    factors' precisions and that of their precisions times means, (n_tasks, 2 * latent_dim).
+    The posterior is a product of Gaussians, one factor for each transition: its mean, and its variance after a softplus, are
+    outputs of the network. What was taken in of a task is the sum of the factors' precisions and that of their precisions
+    times means, (n_tasks, 2 * latent_dim).
 
     An encoder of another kind has the same three methods, see :class:`sb3_htr.adaptation.policy.Encoder`, and the same
     constructor: ``policy_kwargs={"encoder_class": MyEncoder}``. For ``cuda_graph``, it waits for no value that it computes,
@@ -88,7 +89,8 @@ class ContextEncoder(nn.Module):
 
 class PriorFactorEncoder(ContextEncoder):
     """
-    The same with the prior N(0, I) as one more factor of the product, and factors whose precision can be nothing.
+    The same with the prior N(0, I) as one more factor of the product, and factors whose precision, which the softplus is of
+    here, can be nothing.
 
     Bayes' rule has this factor, PEARL's product has not: there, every transition narrows the posterior, and that of a hundred
     misses is as narrow as that of a success. Here, what says nothing of the task changes nothing, however much of it there is.

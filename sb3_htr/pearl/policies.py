@@ -89,8 +89,8 @@ class PEARLPolicy(LatentPolicy, SACPolicy):
     :param use_next_obs_in_context: a row of the context is (o, a, r, o'), for tasks that differ in their dynamics (as in
         PEARL's reference, which has it for such families alone)
     :param normalize_observations: all networks see observations less their running mean in training, divided by the standard
-        deviation. By measurement (one seed each), the Wheeled robot learns in half the steps with it, and the Point Robot as
-        well as without it
+        deviation, and clipped to [-10, 10]. By measurement (one seed each), the Wheeled robot learns in half the steps with
+        it, and the Point Robot as well as without it
     :param activation_fn: activation of all networks
     :param n_critics: number of critics
     :param optimizer_class: optimizer of all networks
