@@ -177,7 +177,7 @@ class AntEnv(DynamicsEnv):
     - `healthy_reward`, for each step that does not terminate the episode;
     - `ctrl_cost`: `ctrl_cost_weight` times the squared length of the clipped action;
     - `contact_cost`: `contact_cost_weight` times the sum of the squared contact forces, each clipped at 1 N. They are the
-      normal forces on the four lower legs at the last physics step.
+      normal forces on the four lower legs as the last physics step begins.
 
     `info["is_success"]` is `d < goal_radius`.
 
