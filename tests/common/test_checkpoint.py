@@ -5,19 +5,20 @@ import fcntl
 import json
 import os
 import random
+import resource
 import shutil
 import stat
 import struct
-import subprocess
-import sys
 import warnings
 from collections.abc import Callable
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch as th
 
+from helpers import MakePEARL
 from helpers.bombs import Bomb
 from helpers.disks import disk
 from sb3_htr.common.atomic import atomic_path
@@ -179,28 +180,30 @@ def test_a_damaged_checkpoint_gives_one_sentence_and_the_next_older_one_is_taken
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the memory of a process is measured as Linux does")
-def test_too_little_memory_is_no_damage(tmp_path: Path) -> None:
+def test_too_little_memory_is_no_damage(tmp_path: Path, tiny_pearl: MakePEARL) -> None:
     """The latest checkpoint is whole: a training that went on from an older one would write over it."""
     write_checkpoint(tmp_path / CHECKPOINTS / "2_steps", {"ring": th.zeros(3 * 10**7)})
     write_checkpoint(tmp_path / CHECKPOINTS / "1_steps", {})
     shutil.copy(tmp_path / CHECKPOINTS / "2_steps" / STATE, tmp_path / "replay.pt")
-    code = f"""
-import resource, pathlib, htr_envs
-from sb3_htr import PEARL
-from sb3_htr.common.checkpoint import load_latest
-model = PEARL("MlpPolicy", "SparsePointRobot-v0")
-used = int(pathlib.Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-resource.setrlimit(resource.RLIMIT_AS, (used + 6 * 10**7,) * 2)
-for read, path in (load_latest, pathlib.Path({str(tmp_path)!r})), (model.load_replay_buffer, {str(tmp_path / "replay.pt")!r}):
-    try:
-        read(path)
-    except MemoryError as error:
-        print(error)
-"""
-    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    of_checkpoint, of_replay = process.stdout.splitlines()
-    assert of_checkpoint.startswith(f"There is too little memory to read {tmp_path / CHECKPOINTS / '2_steps'}"), process.stderr
-    assert of_replay.startswith(f"There is too little memory to read {tmp_path / 'replay.pt'}"), process.stderr
+    model, context = tiny_pearl(), get_context("fork")  # a new interpreter would import torch once more
+    said = context.SimpleQueue()
+
+    def read_both() -> None:
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (used + 6 * 10**7,) * 2)
+        for read, path in (load_latest, tmp_path), (model.load_replay_buffer, tmp_path / "replay.pt"):
+            try:
+                read(path)  # type: ignore[operator]
+                said.put("it was read")
+            except Exception as error:
+                said.put(f"{type(error).__name__}: {error}")
+
+    process = context.Process(target=read_both)
+    process.start()
+    process.join()
+    assert process.exitcode == 0
+    for path in (tmp_path / CHECKPOINTS / "2_steps", tmp_path / "replay.pt"):
+        assert said.get().startswith(f"MemoryError: There is too little memory to read {path}")
 
 
 def test_damage_at_350_places_is_noticed_or_harmless(tmp_path: Path) -> None:

@@ -228,18 +228,15 @@ def test_a_killed_worker_process_takes_no_other_with_it() -> None:
 def test_who_stops_stops_what_runs_too(n_begun: int, tmp_path: Path) -> None:
     """Of a driver that is interrupted alone, as by a scheduler; what did not begin yet never does."""
     executor = Processes(2)
-    futures = [executor.submit(_sleep, tmp_path / str(i)) for i in range(3)]
+    # A function of this file would have each process import all that the file does
+    sleeps = "import pathlib, time; pathlib.Path({!r}).touch(); time.sleep(100)"
+    futures = [executor.submit(exec, sleeps.format(str(tmp_path / str(i)))) for i in range(3)]
     while len(list(tmp_path.iterdir())) < n_begun:
         time.sleep(0.01)
     start = time.monotonic()
     executor.shutdown(cancel_futures=True)
     assert time.monotonic() - start < 50 and futures[2].cancelled()
     assert all(isinstance(future.exception(), KeyboardInterrupt) for future in futures[:2])
-
-
-def _sleep(begun: Path) -> None:
-    begun.touch()
-    time.sleep(100)
 
 
 def test_a_node_on_which_all_fails_at_once_does_not_take_the_queue(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,7 @@
 """Results of one time are part of those of another: nothing is trained twice, mixed up, or lost."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,17 +22,24 @@ def experiment_of(name: str, *variants: Variant) -> Experiment:
     return Experiment(name, "", ENV_ID, 480, variants, 2, eval_freq=240, evaluations=by(("prior",)))
 
 
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results of an experiment that somebody ran, once for all tests."""
+    folder, theirs = tmp_path_factory.mktemp("written"), experiment_of("theirs", *THEIRS)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sb3_htr.zoo.plots.intervals.REPS", 50)
+        report.write("", theirs, made_up(theirs.cells(), folder), folder / "published")
+    return folder / "published"
+
+
 @pytest.fixture(autouse=True)
-def published(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Results of an experiment that somebody ran, and a working folder without its runs."""
+def published(written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of them, in a working folder without their runs."""
     monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 50)
     monkeypatch.chdir(tmp_path)
-    theirs = experiment_of("theirs", *THEIRS)
-    monkeypatch.setitem(grid.EXPERIMENTS, "theirs", theirs)
+    monkeypatch.setitem(grid.EXPERIMENTS, "theirs", experiment_of("theirs", *THEIRS))
     monkeypatch.setitem(grid.EXPERIMENTS, "mine", experiment_of("mine", *THEIRS, Variant("htr-ser", "mine", {"gamma": 0.5})))
-    (tmp_path / "elsewhere").mkdir()
-    report.write("", theirs, made_up(theirs.cells(), tmp_path / "elsewhere"), tmp_path / "published")
-    return tmp_path / "published"
+    return Path(shutil.copytree(written, tmp_path / "published"))
 
 
 def test_a_method_of_ones_own_is_trained_alone_and_reported_beside_what_others_ran(

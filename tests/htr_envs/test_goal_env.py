@@ -694,7 +694,8 @@ fetch_reach = pytest.mark.parametrize("env_id", FETCH[:1])
 
 @all_suites
 def test_check_task_env(env_id: str) -> None:
-    check_task_env(make(env_id)[0])
+    """All for as long as an episode of Fetch is: what hides a goal does the same at each step."""
+    check_task_env(make(env_id, max_episode_steps=50)[0])
 
 
 @all_suites
