@@ -117,7 +117,10 @@ def test_a_new_family_takes_less_than_60_lines() -> None:
 # Later arguments win, so these make each command of the manual a short one
 SHORT = {
     "train": ["-n", "480", "--eval-freq", "480", "--eval-episodes", "2", "--verbose", "0", "-params", *SMALL],
-    "optimize": ["-n", "480", "--verbose", "0", "-params", *(setting for setting in SMALL if "policy_kwargs" not in setting)],
+    "optimize": [
+        *["-n", "480", "--eval-episodes", "2", "--verbose", "0"],
+        *["-params", *(setting for setting in SMALL if "policy_kwargs" not in setting)],
+    ],
     "evaluate": ["--n-episodes", "2"],
     "enjoy": ["--n-episodes", "2"],
     "record": ["--n-episodes", "1"],
