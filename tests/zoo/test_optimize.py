@@ -75,7 +75,7 @@ def test_workers_with_one_command_do_not_draw_alike(quick: None, tmp_path: Path,
     storage = f"sqlite:///{tmp_path}/study.db"
     optuna.create_study(study_name="one", storage=storage).ask()
     command = ["optimize", "--env", ENV_ID, "-n", "240", "--n-trials", "1", "-f", str(tmp_path), "--seed", "1"]
-    command += ["--eval-episodes", "2"]
+    command += ["--eval-episodes", "2", "--n-evaluations", "1"]
     command += ["--storage", storage, "--study-name", "one", "--verbose", "0", *SMALL]
     for _ in range(2):
         assert main(command) == 0
@@ -287,7 +287,8 @@ def test_a_search_pickles_no_study_that_a_storage_has(quick: None, tmp_path: Pat
     for storage, suffixes in (("", {".csv", ".pkl"}), (f"sqlite:///{tmp_path}/study.db", {".csv"})):
         folder = tmp_path / ("kept" if storage else "lost")
         of_study = ["--storage", storage, "--study-name", "x"] if storage else []
-        main(["optimize", "--env", ENV_ID, "-n", "240", "--n-trials", "1", "-f", str(folder), *of_study, *SMALL])
+        little = ["-n", "240", "--n-trials", "1", "--n-evaluations", "1", "--eval-episodes", "2"]
+        main(["optimize", "--env", ENV_ID, *little, "-f", str(folder), *of_study, *SMALL])
         assert {path.suffix for path in folder.rglob("report_*")} == suffixes
 
 
@@ -423,7 +424,8 @@ def test_a_rival_is_searched_for_and_trained_with_what_was_found(
     small = ["-params", "n_envs:4", "n_episodes_per_trial:2", "n_trials_per_rollout:1", "policy_kwargs:{'net_arch':[4]}"]
     storage = ["--study-name", "test", "--storage", f"sqlite:///{tmp_path}/study.db", "-f", str(tmp_path), "--verbose", "0"]
     arguments = ["--env", ENV_ID, "--method", "rl2", "--env-kwargs", "goal_distance:0.1", "-n", "320"]
-    assert main(["optimize", *arguments, *storage, "--n-trials", "2", "--n-evaluations", "2", *small]) == 0
+    little = ["--n-trials", "2", "--n-evaluations", "2", "--eval-episodes", "2"]
+    assert main(["optimize", *arguments, *storage, *little, *small]) == 0
     assert "Train with the best trial so far: sb3-htr train" in capsys.readouterr().out
     trial = optimize.create_study(storage[3], "test").trials[1]
     assert set(trial.params) == {"n_epochs", "lstm_hidden_size"}
@@ -447,7 +449,8 @@ def test_what_a_user_gives_is_not_searched(tmp_path: Path, monkeypatch: pytest.M
     params = ["-params", *(f"{key}:{value!r}" for key, value in given.items()), "n_envs:4", "gamma:0.5"]
     storage = f"sqlite:///{tmp_path}/s.db"
     arguments = ["optimize", "--env", ENV_ID, "-f", str(tmp_path), "-n", "480", "--n-trials", "1", "--n-evaluations", "1"]
-    assert main([*arguments, "--storage", storage, "--study-name", "test", "--verbose", "0", *params]) == 0
+    of_study = ["--eval-episodes", "2", "--storage", storage, "--study-name", "test"]
+    assert main([*arguments, *of_study, "--verbose", "0", *params]) == 0
     (trial,) = optimize.create_study(storage, "test").get_trials()
     searched = {"learning_rate", "tau", "ent_coef", "kl_coef", "latent_dim", "n_steps"}
     assert set(trial.params) == {*searched, "relabel_probability", "hindsight_task_strategy"}
@@ -499,7 +502,8 @@ def test_the_objective_is_the_return_after_adaptation(quick: None, tmp_path: Pat
     arguments = ["optimize", "--env", ENV_ID, "-f", str(tmp_path), "-n", "480", "--n-trials", "1", "--n-evaluations", "1"]
     storage = ["--storage", f"{tmp_path}/s.log", "--study-name", "test", "--optimization-log-path", str(log)]
     # Every goal disc of this distance holds the start, so that there are rewards
-    assert main([*arguments, *storage, "--verbose", "0", "--env-kwargs", "goal_distance:0.05", *SMALL]) == 0
+    near = ["--env-kwargs", "goal_distance:0.05"]
+    assert main([*arguments, *storage, "--eval-episodes", "2", "--verbose", "0", *near, *SMALL]) == 0
     evaluations = np.load(log / "trial_0" / "evaluations.npz")
     value = optimize.create_study(f"{tmp_path}/s.log", "test").best_value
     assert value == pytest.approx(evaluations["returns"][-1, :, -1].mean()) and value > 0
