@@ -17,7 +17,9 @@ from sb3_htr.htr import EpisodeClustering
 from sb3_htr.zoo.cli import main
 
 # 100,000 in the nightly run
-N_UPDATES = int(os.environ.get("SB3_HTR_UPDATES", 3_000))
+N_UPDATES = int(os.environ.get("SB3_HTR_UPDATES", 1_200))
+# Bytes for each: what is measured varies by 0.2 MB
+ALLOWED = 2_000
 
 
 def resident_bytes() -> int:
@@ -44,7 +46,8 @@ def test_memory_is_flat_once_the_buffers_are_full() -> None:
     """Libraries keep what they prepare for each size of arrays, which in this process other tests may have brought about."""
     with get_context("spawn").Pool(1) as pool:
         before, after = pool.apply(train_with_full_buffers, [N_UPDATES])
-    assert after < 1.02 * before, f"{before / 1e6:.1f} to {after / 1e6:.1f} MB"
+    allowed = min(0.02 * before, ALLOWED * N_UPDATES)
+    assert after < before + allowed, f"{before / 1e6:.1f} to {after / 1e6:.1f} MB"
 
 
 def test_the_number_of_hindsight_buffers_is_all_that_grows_in_ec(tiny_pearl: MakePEARL) -> None:

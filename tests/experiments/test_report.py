@@ -22,6 +22,18 @@ from sb3_htr.experiments.table import table as as_markdown
 from sb3_htr.zoo.run.method import methods
 
 
+@pytest.fixture
+def rough(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures are drawn, but once each, and without looking for the room that everything in them needs."""
+    save = Figure.savefig
+
+    def save_roughly(figure: Figure, path: Path, **_: Any) -> None:
+        figure.set_layout_engine("none")
+        save(figure, path, dpi=40)
+
+    monkeypatch.setattr(Figure, "savefig", save_roughly)
+
+
 def test_without_successes_no_picture_says_how_well_they_are_predicted(tmp_path: Path) -> None:
     (cell, path), *_ = made_up(EXPERIMENTS["point_maze"].cells(1), tmp_path).items()
     np.savez(path, **{**np.load(path), "calibration": np.zeros((10, 3))})
@@ -41,7 +53,7 @@ def test_what_reward_models_say_is_told_apart_without_colours(tmp_path: Path, mo
 @pytest.mark.parametrize("name", ["point_robot", "wheeled", "ablation", "goal_distance", "relabelling", "rivals"])
 @pytest.mark.parametrize("chosen", [slice(-1, None), slice(1, None, 2)], ids=["the last run", "every other run"])
 def test_what_is_finished_of_an_experiment_is_reported_alone(
-    name: str, chosen: slice, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, chosen: slice, rough: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 50)
     experiment = EXPERIMENTS[name]
@@ -63,7 +75,7 @@ def test_what_is_finished_of_an_experiment_is_reported_alone(
 
 
 @pytest.mark.parametrize("name", ["point_robot", "rivals", "relabelling"])
-def test_a_run_may_have_an_evaluation_more_than_others(name: str, tmp_path: Path) -> None:
+def test_a_run_may_have_an_evaluation_more_than_others(name: str, rough: None, tmp_path: Path) -> None:
     """As where rollouts are longer than the time between two."""
     results = made_up(EXPERIMENTS[name].cells(2), tmp_path)
     for path in [*results.values()][: len(results) // 2]:
@@ -75,7 +87,9 @@ def test_a_run_may_have_an_evaluation_more_than_others(name: str, tmp_path: Path
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_an_experiment_reports_what_its_runs_did(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_experiment_reports_what_its_runs_did(
+    name: str, rough: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     experiment, folder = EXPERIMENTS[name], tmp_path / "results" / name
     cells = experiment.cells(3)
     monkeypatch.setattr("sb3_htr.zoo.plots.intervals.REPS", 50)

@@ -215,7 +215,7 @@ def test_a_pearl_learns_with_it(kind: dict[str, Any], tiny_pearl: MakePEARL) -> 
     logged = model.logger.name_to_value
     assert 0 < logged["replay/relabelling_entropy"] < np.log(8)
     assert logged["replay/rewarded_fraction_hindsight"] > logged["replay/rewarded_fraction_real"] > 0
-    returns, _ = evaluate_adaptation(model, env, n_episodes=2)
+    returns, _ = evaluate_adaptation(model, env, "validation", n_episodes=2)
     assert np.isfinite(returns).all()
 
 

@@ -321,7 +321,7 @@ def test_kills_at_random_moments_change_nothing(unbroken: Path, tmp_path: Path) 
             shutil.rmtree(run.parent)
     (run / f"{ENV_ID}.zip").unlink(missing_ok=True)
     (run / "checkpoints" / ".240_steps.1.tmp").mkdir()  # as a kill while writing leaves it
-    subprocess.run([*command, "train", "--resume", str(run)], env=environment, check=True, capture_output=True)
+    assert main(["train", "--resume", str(run)]) == 0
     assert_same_run(run, unbroken)
     assert len(list((run / "checkpoints").iterdir())) == 2
 
