@@ -290,7 +290,7 @@ def test_an_evaluation_in_the_env_of_training_leaves_its_random_state_alone(tiny
     model = tiny_pearl(env).learn(ROLLOUT)
     before = get_env_states(env)
     assert len({*before}) == (1 if batched else 4)
-    evaluate_adaptation(model, env, n_episodes=1)
+    evaluate_adaptation(model, env, "validation", n_episodes=1)
     assert get_env_states(env) == before
 
 

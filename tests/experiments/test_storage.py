@@ -439,7 +439,7 @@ def test_a_cell_that_another_user_alone_may_lock_is_named(tmp_path: Path, monkey
 
 def test_a_killed_node_costs_what_it_had_not_sent(tmp_path: Path, url: str) -> None:
     """The result is that of a run that nobody disturbed."""
-    (cell,) = Experiment("one", "", ENV_ID, 4_800, (TINY_RUN,), 1, 480, by(("prior",)), n_episodes=2).cells()
+    (cell,) = Experiment("one", "", ENV_ID, 4_800, (TINY_RUN,), 1, 1200, by(("prior",)), n_episodes=2).cells()
     pickled = tmp_path / "cell"
     pickled.write_bytes(pickle.dumps(cell))
     paths = os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])

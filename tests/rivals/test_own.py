@@ -188,7 +188,7 @@ def test_training_is_on_training_tasks_after_an_evaluation_in_the_same_env(regis
         model, seen = make(), set[int]()
         env = model.get_env()
         assert env is not None
-        evaluate_adaptation(model, env, n_episodes=1)
+        evaluate_adaptation(model, env, "validation", n_episodes=1)
 
         def look(local: dict[str, Any], _: Any, seen: set[int] = seen) -> bool:
             seen.update(info["task_id"] for info in local["infos"])

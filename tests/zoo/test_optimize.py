@@ -424,8 +424,8 @@ def test_a_rival_is_searched_for_and_trained_with_what_was_found(
     small = ["-params", "n_envs:4", "n_episodes_per_trial:2", "n_trials_per_rollout:1", "policy_kwargs:{'net_arch':[4]}"]
     storage = ["--study-name", "test", "--storage", f"sqlite:///{tmp_path}/study.db", "-f", str(tmp_path), "--verbose", "0"]
     arguments = ["--env", ENV_ID, "--method", "rl2", "--env-kwargs", "goal_distance:0.1", "-n", "320"]
-    little = ["--n-trials", "2", "--n-evaluations", "2", "--eval-episodes", "2"]
-    assert main(["optimize", *arguments, *storage, *little, *small]) == 0
+    trials = ["--n-trials", "2", "--n-evaluations", "2", "--eval-episodes", "2"]
+    assert main(["optimize", *arguments, *storage, *trials, *small]) == 0
     assert "Train with the best trial so far: sb3-htr train" in capsys.readouterr().out
     trial = optimize.create_study(storage[3], "test").trials[1]
     assert set(trial.params) == {"n_epochs", "lstm_hidden_size"}
