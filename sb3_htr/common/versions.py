@@ -95,12 +95,12 @@ def made_by() -> dict[str, Any]:
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     """
     :param before: as of :func:`made_by`
-    :param now: the same, of other code
+    :param now: the same, of other code or another run
     :return: what is not alike, as ``"torch 2.12.0 -> 2.13.0"``
     """
     old, new = ({**code.get("versions", {}), "commit": named({**code, "resumed_by": ()})} for code in (before, now))
     # Two working trees with changes have one name; older records have no digest
-    if old["commit"] == new["commit"] and "code" in before:
+    if old["commit"] == new["commit"] and "code" in before and "code" in now:
         old["code"], new["code"] = (str(code["code"])[:10] for code in (before, now))
     return [
         f"{name} {old.get(name, 'unknown')} -> {new.get(name, 'none')}"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sb3_htr.common.versions import commit
+from sb3_htr.common.versions import commit, differences
 
 
 def test_a_path_that_is_no_text_does_not_stop_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -30,3 +30,9 @@ def test_a_checkout_is_read_and_nothing_is_written(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr("sb3_htr.common.versions.__file__", str(code))
     assert commit()["clean"] is True
     assert (tmp_path / ".git" / "index").read_bytes() == index
+
+
+@pytest.mark.parametrize("digests", [("a" * 20, None), (None, "a" * 20), ("a" * 20, "a" * 20)])
+def test_a_record_without_a_digest_differs_in_nothing(digests: tuple[str | None, str | None]) -> None:
+    before, now = ({"commit": "0123456789", **({} if digest is None else {"code": digest})} for digest in digests)
+    assert differences(before, now) == []

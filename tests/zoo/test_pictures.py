@@ -351,6 +351,9 @@ def test_plot_says_what_is_missing_in_a_curve(
     assert "Not all of these runs were made by one code: commit unknown -> 0123456789, torch unknown -> 1.0." in said
     assert main([*command[:2], *command[6:]]) == 0
     assert "one code" not in capsys.readouterr().err
+    resumed = make_run(tmp_path / "resumed", model, resumed_by=[{"from": 480, **other_code}])
+    assert main(["plot", str(resumed), *command[6:]]) == 0
+    assert "one code: commit unknown -> 0123456789" in capsys.readouterr().err
     with pytest.raises(ValueError, match=r"-o is learning.svg, expected a folder"):
         main(["plot", *NOWHERE, "-o", "learning.svg"])
     (tmp_path / "file").touch()

@@ -132,7 +132,8 @@ def groups_of(parser: argparse.ArgumentParser, args: argparse.Namespace) -> dict
     if any(kwargs != next(iter(of_each.values())) for kwargs in of_each.values()):
         print(f"The envs of these curves have different arguments, {of_each}: their tasks are not the same.", file=sys.stderr)
     records = [agent.record for agents in groups.values() for agent in agents]
-    if other := dict.fromkeys(difference for record in records for difference in differences(records[0], record)):
+    codes = [code for record in records for code in (record, *record.get("resumed_by", ()))]
+    if other := dict.fromkeys(difference for code in codes for difference in differences(codes[0], code)):
         print(f"Not all of these runs were made by one code: {', '.join(other)}. Curves may differ by it.", file=sys.stderr)
     return groups
 
