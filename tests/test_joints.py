@@ -359,12 +359,13 @@ def test_a_loss(tmp_path: Path, cuda_graph: bool) -> None:
     assert "train/decoder_loss" in loaded.logger.name_to_value
 
 
-def test_a_loss_has_a_name_of_its_own() -> None:
+@pytest.mark.parametrize("name", ["critic_loss", "relabelled_fraction", "kl_coef", "n_updates", "learning_rate"])
+def test_a_loss_has_a_name_of_its_own(name: str) -> None:
     class Nameless(PEARL):
         def auxiliary_losses(self, data: Any, obs: th.Tensor, z: th.Tensor, *posterior: th.Tensor) -> dict[str, th.Tensor]:
-            return {**super().auxiliary_losses(data, obs, z, *posterior), "critic_loss": z.square().mean()}
+            return {**super().auxiliary_losses(data, obs, z, *posterior), name: z.square().mean()}
 
-    with pytest.raises(ValueError, match="auxiliary_losses has a loss named critic_loss, which is logged already"):
+    with pytest.raises(ValueError, match=f"auxiliary_losses has a loss named {name}, which is logged already"):
         Nameless("MlpPolicy", ENV_ID, **TINY).learn(3 * ROLLOUT)
 
 

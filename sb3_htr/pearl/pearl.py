@@ -26,6 +26,8 @@ from sb3_htr.pearl.policies import LatentCritic, MlpPolicy, PEARLPolicy
 LEARNING_RATE = LinearSchedule(start=1e-3, end=0.0, end_fraction=1.0)
 # Transitions of a meta-batch that the reward model learns from, each under all its tasks
 N_LABELLED = 256
+# What is logged as train/ besides the values of a gradient step
+LOGGED_BESIDE = ("relabelled_fraction", "rl_zero_reward_fraction", "kl_coef", "learning_rate", "n_updates")
 
 
 class PEARL(OffPolicyMetaAlgorithm):
@@ -338,7 +340,7 @@ class PEARL(OffPolicyMetaAlgorithm):
             "q_value": (q.detach().mean(dim=0) * weight).sum(),
             "rl_reward_mean": (data.rewards * weight).sum(),
         }
-        if taken := sorted(log.keys() & auxiliary_losses.keys()):
+        if taken := sorted({*log, *LOGGED_BESIDE} & auxiliary_losses.keys()):
             raise ValueError(f"auxiliary_losses has a loss named {taken[0]}, which is logged already: choose another name.")
         log |= {name: value.detach() for name, value in auxiliary_losses.items()}
         return mean.detach(), log
