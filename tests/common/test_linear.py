@@ -156,6 +156,7 @@ def test_an_output_may_be_overwritten_as_that_of_torch_may() -> None:
 def test_products_are_left_to_torch_where_these_are_as_fast(
     name: str, takes_onednn: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    assert (linear.onednn is None) is (linear.faster_than_torch() is None), "what layers are made with"
     monkeypatch.setattr(linear, "processor", lambda: name)
     assert (linear.faster_than_torch() is not None) is takes_onednn
 
