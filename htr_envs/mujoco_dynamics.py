@@ -100,7 +100,7 @@ class MujocoDynamics(Dynamics[PositionGoalFamily]):
             raise ValueError(f"reset_noise_scale is {reset_noise_scale!r}, expected a finite number from 0 on.")
         if n_threads is None:
             n_threads = min(available_threads(), max(1, num_envs // self.envs_per_thread))
-        if not isinstance(n_threads, int | np.integer) or n_threads < 1:
+        if isinstance(n_threads, bool) or not isinstance(n_threads, int | np.integer) or n_threads < 1:
             raise ValueError(f"n_threads is {n_threads!r}: pass a whole number from 1 on, or None for as many as CPUs.")
         # a state that is not finite is not replaced by the first one: the episode ends
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART | mujoco.mjtDisableBit.mjDSBL_AUTORESET
