@@ -200,7 +200,8 @@ def test_too_little_memory_is_no_damage(tmp_path: Path, tiny_pearl: MakePEARL) -
 
     process = context.Process(target=read_both)
     process.start()
-    process.join()
+    process.join(60)
+    process.kill()
     assert process.exitcode == 0
     for path in (tmp_path / CHECKPOINTS / "2_steps", tmp_path / "replay.pt"):
         assert said.get().startswith(f"MemoryError: There is too little memory to read {path}")
