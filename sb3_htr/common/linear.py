@@ -199,7 +199,7 @@ class Linear(nn.Linear):
     """
     ``nn.Linear`` with the same parameters and results, for batches of rows (n, in_features).
 
-    Elsewhere than on a CPU that is not Intel's, for few rows, for other than float32, and where
+    On a GPU, on Intel's processors, where torch has no such operation, for few rows, for other than float32, and where
     ``torch.set_float32_matmul_precision`` allows less than that, it is ``nn.Linear``.
     """
 

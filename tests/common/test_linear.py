@@ -32,11 +32,20 @@ LAYERS = {
 }
 
 
+# What layers are made with on this processor
+HERE = linear.onednn
+
+
+@pytest.fixture(autouse=True)
+def on_every_processor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Layers are tested on those, too, where they are torch's own."""
+    monkeypatch.setattr(linear, "onednn", find_onednn())
+
+
 @pytest.fixture
 def everything_through_onednn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Small products too, and on every processor."""
+    """Small products too."""
     monkeypatch.setattr(linear, "MIN_MULTIPLICATIONS", 0)
-    monkeypatch.setattr(linear, "onednn", find_onednn())
 
 
 def gradients(layer: nn.Module, x: th.Tensor, loss_weight: th.Tensor) -> list[th.Tensor]:
@@ -96,6 +105,7 @@ def test_what_is_left_to_torch_prepares_nothing_in_onednn(onednn_rows: list[int]
 
 
 @pytest.mark.parametrize("dtype", [th.float64, th.bfloat16])
+@pytest.mark.usefixtures("everything_through_onednn")
 def test_other_types_and_lower_precision_are_left_to_torch(dtype: th.dtype) -> None:
     layer, x = Linear(8, 8).to(dtype), th.randn(2 * MIN_ROWS, 8, dtype=dtype)
     th.testing.assert_close(layer(x), nn.functional.linear(x, layer.weight, layer.bias), rtol=0, atol=0)
@@ -156,12 +166,11 @@ def test_an_output_may_be_overwritten_as_that_of_torch_may() -> None:
 def test_products_are_left_to_torch_where_these_are_as_fast(
     name: str, takes_onednn: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert (linear.onednn is None) is (linear.faster_than_torch() is None), "what layers are made with"
+    assert (HERE is None) is (linear.faster_than_torch() is None)
     monkeypatch.setattr(linear, "processor", lambda: name)
     assert (linear.faster_than_torch() is not None) is takes_onednn
 
 
-@pytest.mark.usefixtures("everything_through_onednn")
 def test_a_torch_without_the_private_operation_uses_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     assert find_onednn() is not None, "the tested version of torch has it"
     layer, x = Linear(64, 64), th.randn(1024, 64)
@@ -185,7 +194,6 @@ def test_replaced_layers_keep_their_parameters() -> None:
     assert all(th.equal(before[name], value) for name, value in module.state_dict().items())
 
 
-@pytest.mark.usefixtures("everything_through_onednn")
 def test_second_derivatives_are_refused() -> None:
     layer, x = Linear(8, 8), th.randn(MIN_ROWS, 8, requires_grad=True)
     with pytest.raises(RuntimeError, match=r"no second derivatives \(create_graph\)"):
