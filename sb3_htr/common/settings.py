@@ -96,7 +96,7 @@ def check_numbers(**numbers: tuple[Any, float] | tuple[Any, float, float]) -> No
         kind = int if whole else int | float
         # written so that nan, which compares with nothing, is refused too
         if isinstance(value, bool) or not (isinstance(value, kind) and low <= value <= high):
-            is_infinite = isinstance(value, float) and np.isinf(value)
+            is_infinite = isinstance(value, float) and np.isinf(value) and high < np.inf
             article = "a whole number" if whole else "a finite number" if is_infinite else "a number"
             # Whole numbers in full: of a large one, the first digits are another number
             least, most = (limit if isinstance(limit, int) else f"{limit:g}" for limit in (low, high))

@@ -251,6 +251,7 @@ def test_reset_forgets() -> None:
     ("kind", "message"),
     [
         ({"name": "HindsightForesight", "temperature": -1}, "temperature is -1, expected a number of at least 0"),
+        ({"name": "HindsightForesight", "temperature": -np.inf}, "temperature is -inf, expected a number of at least 0"),
         ({"name": "HindsightForesight", "temperature": 0.0}, "temperature is 0, by which utilities cannot be divided"),
         ({"name": "HindsightForesight", "n_starts": 0}, "n_starts is 0, expected a whole number of at least 1"),
         ({"name": "HindsightInference", "n_starts": 3}, "'HindsightInference' has no setting 'n_starts'"),
