@@ -89,8 +89,8 @@ class ContextEncoder(nn.Module):
 
 class PriorFactorEncoder(ContextEncoder):
     """
-    The same with the prior N(0, I) as one more factor of the product, and factors whose precision, which the softplus is of
-    here, can be nothing.
+    The same with the prior N(0, I) as one more factor of the product. The softplus is of a factor's precision here, and not of
+    its variance, so that a factor can be nothing.
 
     Bayes' rule has this factor, PEARL's product has not: there, every transition narrows the posterior, and that of a hundred
     misses is as narrow as that of a success. Here, what says nothing of the task changes nothing, however much of it there is.
