@@ -290,7 +290,7 @@ def test_an_explorer_named_by_its_record_is_the_agents_own(explorer: Any, tmp_pa
     model = agent.load()
     assert isinstance(model, PEARL)
     assert model.start_adaptation(1, "belief").explorer.margin == model.explorer.margin  # type: ignore[attr-defined]
-    assert main(["plot", str(run), str(run), "-l", "A", "B", "-o", str(tmp_path / "x.png"), "--n-episodes", "2"]) == 0
+    assert main(["plot", str(run), str(run), "-l", "A", "B", "-o", str(tmp_path / "plots"), "--n-episodes", "2"]) == 0
 
 
 @pytest.mark.parametrize("defaults", [["--save-freq", "20000"], ["--save-freq", "20000", "--eval-episodes", "20"]])
