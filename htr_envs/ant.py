@@ -8,12 +8,12 @@ from typing import Any, ClassVar
 import gymnasium
 import numpy as np
 
+from htr_envs.arguments import finite_float
 from htr_envs.dynamics import DynamicsEnv
 from htr_envs.mujoco_dynamics import (  # says so where MuJoCo is missing
     DoubleArray,
     MujocoDynamics,
     MujocoVectorEnv,
-    finite_float,
     mujoco,
 )
 from htr_envs.semicircle_goals import LOCOMOTION_ARENA, AntGoalFamily

@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 from abc import abstractmethod
 from collections.abc import Callable
-from numbers import Real
 from typing import Any, ClassVar
 from weakref import WeakSet
 
@@ -18,11 +17,11 @@ from gymnasium import spaces
 from gymnasium.error import DependencyNotInstalled
 from numpy.typing import NDArray
 
+from htr_envs.arguments import are_numbers, are_whole
 from htr_envs.dynamics import Dynamics, DynamicsVectorEnv, refuse_pictures
 from htr_envs.headless import open_no_window
 from htr_envs.position_goals import PositionGoalFamily
 from htr_envs.task_env import BoolArray, FloatArray
-from htr_envs.task_sets import are_numbers
 
 try:
     import mujoco
@@ -100,7 +99,7 @@ class MujocoDynamics(Dynamics[PositionGoalFamily]):
             raise ValueError(f"reset_noise_scale is {reset_noise_scale!r}, expected a finite number from 0 on.")
         if n_threads is None:
             n_threads = min(available_threads(), max(1, num_envs // self.envs_per_thread))
-        if isinstance(n_threads, bool) or not isinstance(n_threads, int | np.integer) or n_threads < 1:
+        if not are_whole(n_threads) or n_threads < 1:
             raise ValueError(f"n_threads is {n_threads!r}: pass a whole number from 1 on, or None for as many as CPUs.")
         # a state that is not finite is not replaced by the first one: the episode ends
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_WARMSTART | mujoco.mjtDisableBit.mjDSBL_AUTORESET
@@ -273,19 +272,6 @@ class MujocoVectorEnv(DynamicsVectorEnv):
     ) -> None:
         refuse_pictures(kwargs)
         super().__init__(*self.make(num_envs, n_threads, **kwargs), max_episode_steps, reward_type)
-
-
-def finite_float(name: str, value: float) -> np.float32:
-    """A number of float32, such as the weight of a cost.
-
-    :param name: of it.
-    :param value: the number.
-    :return: the same.
-    :raises ValueError: if it is not finite.
-    """
-    if not isinstance(value, Real) or not abs(value) <= np.finfo(np.float32).max:
-        raise ValueError(f"{name} is {value!r}, expected a finite number of float32.")
-    return np.float32(value)
 
 
 def _add_discs(spec: mujoco.MjSpec) -> None:

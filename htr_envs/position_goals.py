@@ -6,8 +6,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike
 
+from htr_envs.arguments import are_numbers
 from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, at_step, check_reward_type, l2_distance
-from htr_envs.task_sets import are_numbers
 
 
 class PositionGoalFamily(TaskFamily):

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from htr_envs.arguments import are_numbers
 from htr_envs.position_goals import PositionGoalFamily
 from htr_envs.task_env import FloatArray
-from htr_envs.task_sets import are_numbers, draw_task_sets
+from htr_envs.task_sets import draw_task_sets
 
 LOCOMOTION_ARENA = 20.0  # a robot gets up to 10 in 200 steps
 

@@ -8,9 +8,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
+from htr_envs.arguments import are_numbers
 from htr_envs.dynamics import Dynamics, DynamicsEnv, DynamicsVectorEnv, refuse_pictures
 from htr_envs.task_env import BoolArray, FloatArray, TaskFamily, Trajectory, at_step, check_reward_type, l2_distance
-from htr_envs.task_sets import are_numbers, draw_task_sets
+from htr_envs.task_sets import draw_task_sets
 
 FRICTION = np.float32(0.95)
 THRUST = np.float32(0.2)

@@ -2,23 +2,13 @@
 
 from __future__ import annotations
 
-from numbers import Real
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
+from htr_envs.arguments import are_whole
+
 # How near drawn tasks may be to others, as shares of the range, and how often they are drawn until none is nearer
 NEAREST, MAX_DRAWS = 1e-6, 100
-
-
-def are_numbers(*values: Any) -> bool:
-    """Whether comparing these with a number says something: arguments of an env come from YAML files and command lines.
-
-    :param values: arguments of an env.
-    :returns: whether each of them is a number.
-    """
-    return all(isinstance(value, Real) and not isinstance(value, bool) for value in values)
 
 
 def check_task_sets(n_train_tasks: int, n_validation_tasks: int, n_test_tasks: int, task_seed: int) -> None:
@@ -31,12 +21,12 @@ def check_task_sets(n_train_tasks: int, n_validation_tasks: int, n_test_tasks: i
     :raises ValueError: if one is no whole number, or out of range.
     """
     sizes = n_train_tasks, n_validation_tasks, n_test_tasks
-    if not all(isinstance(n, int | np.integer) and n >= 1 and n is not True for n in sizes):
+    if not are_whole(*sizes) or min(sizes) < 1:
         told = ", ".join(map(repr, sizes))
         raise ValueError(
             f"n_train_tasks, n_validation_tasks, n_test_tasks are {told}: each must be a whole number of at least 1."
         )
-    if not isinstance(task_seed, int | np.integer) or isinstance(task_seed, bool) or not 0 <= task_seed < 2**32:
+    if not are_whole(task_seed) or not 0 <= task_seed < 2**32:
         raise ValueError(f"task_seed is {task_seed!r}, expected a whole number from 0 to {2**32 - 1}.")
 
 
