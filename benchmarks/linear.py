@@ -5,7 +5,7 @@ from unittest import mock
 
 import numpy as np
 import torch as th
-from _common import Figure, by_turns, faster, seconds, write
+from _common import Figure, by_turns, faster, make_model, seconds, write
 from torch import nn
 from torch.nn import functional as F
 
@@ -14,6 +14,7 @@ from sb3_htr.common.linear import Linear, Stack, _product, find_onednn
 
 # Rows and units: a critic and the encoder at the paper's sizes, a critic of the fast profile
 SHAPES = [(4096, 300), (16384, 200), (1024, 128)]
+OWN = "torch's own"
 
 
 def public_product(x: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:
@@ -44,11 +45,11 @@ def main() -> None:
         )
         ours, theirs = (2e-9 * n * units**2 / float(np.median(times[key])) for key in ("ours", "torch"))
         name = f"{n} x {units} by {units} x {units}, largest error {errors[0]:.0e} (torch {errors[1]:.0e})"
-        figures.append(Figure(name, "GFLOP/s", ours, theirs, faster(times["ours"], times["torch"]), None, "torch's own"))
+        figures.append(Figure(name, "GFLOP/s", ours, theirs, faster(times["ours"], times["torch"]), None, OWN))
         public = 2e-9 * n * units**2 / float(np.median(times["public"]))
         name = f"{n} x {units} by {units} x {units}"
         figures.append(Figure(name, "GFLOP/s", ours, public, faster(times["ours"], times["public"]), None, "Tensor.to_mkldnn"))
-    write("linear", [*figures, context_figure(), changing_rows_figure()])
+    write("linear", [*figures, context_figure(), changing_rows_figure(), update_figure()])
 
 
 def context_figure() -> Figure:
@@ -63,7 +64,7 @@ def context_figure() -> Figure:
     times = by_turns({key: partial(seconds, partial(forward_and_backward, layer), 20) for key, layer in layers.items()})
     ours, theirs = (4e-9 * n * context_dim * units / float(np.median(times[key])) for key in ("ours", "torch"))
     name = f"{n} x {context_dim} of {columns} columns by {context_dim} x {units}, with its gradient"
-    return Figure(name, "GFLOP/s", ours, theirs, faster(times["ours"], times["torch"]), None, "torch's own")
+    return Figure(name, "GFLOP/s", ours, theirs, faster(times["ours"], times["torch"]), None, OWN)
 
 
 def changing_rows_figure() -> Figure:
@@ -84,6 +85,20 @@ def changing_rows_figure() -> Figure:
     ours, theirs = (1 / float(np.median(times[key])) for key in ("ours", "unpadded"))
     name = "four networks on 800 to 1,500 rows, another number each time"
     return Figure(name, "passes/s", ours, theirs, faster(times["ours"], times["unpadded"]), None, "without rows of zeros")
+
+
+def update_figure() -> Figure:
+    """Updates of the fast profile, most of which are products of such layers."""
+    model = make_model()
+    products = {"ours": linear.onednn, "torch": None}
+
+    def updates(name: str) -> float:
+        with mock.patch.object(linear, "onednn", products[name]):
+            return seconds(partial(model.train, 30, model.batch_size), 1) / 30
+
+    times = by_turns({name: partial(updates, name) for name in products})
+    ours, theirs = (1 / float(np.median(times[name])) for name in products)
+    return Figure("updates of the fast profile", "updates/s", ours, theirs, faster(times["ours"], times["torch"]), None, OWN)
 
 
 if __name__ == "__main__":
